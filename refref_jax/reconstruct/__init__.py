@@ -4,7 +4,8 @@ The visual hull of the masks is a scalar field on a grid (`visual_hull`). Its ze
 mesh (`grids`), which is cleaned, smoothed and remeshed (`refinement`). An occupancy field trained
 on the masks (`occupancy`, as in the paper) yields the same kind of grid. `mesh_distance` compares
 the mesh with a ground-truth mesh and with the masks; `refractive_index` estimates the index from
-images.
+images. `families` finds balls, tori, surfaces of revolution (`revolution`) and convex polyhedra
+(`polyhedra`) in noisy meshes, as surfaces whose few unknowns light can determine (`shapes`).
 """
 
 

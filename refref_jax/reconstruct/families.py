@@ -151,10 +151,10 @@ class Torus:
         normals = self._directions
         points = [unknowns[5], 0.0] + unknowns[6] * normals
         outward = np.broadcast_to([1.0, 0.0], points.shape)
-        turned = _Turned(
+        turned = Turned(
             points, np.stack([outward, normals], axis=-1), normals, np.zeros((*normals.shape, 2))
         )
-        return _place(turned, self._lathe, _AROUND_TORUS, self.axis, unknowns[:5])
+        return place(turned, self._lathe, _AROUND_TORUS, self.axis, unknowns[:5])
 
     def prior(self, unknowns: Unknowns) -> tuple[Matrix, Unknowns]:
         """Returns the prior: near the fit, within 1 % of the diameter and 0.02 radians."""
@@ -206,7 +206,7 @@ class Revolution:
         """Returns zeros: the axis and the profile of the fit."""
         return np.zeros(4 + _KNOTS)
 
-    def profile(self, unknowns: Unknowns) -> "_Turned":
+    def profile(self, unknowns: Unknowns) -> "Turned":
         """Returns points and normals of the profile, and their derivatives by the offsets."""
         points = self.points + self._slopes @ unknowns[4:]
         along = np.stack([m @ points[:, i] for i, m in enumerate(self._along)], axis=-1)
@@ -214,12 +214,12 @@ class Revolution:
         length = np.linalg.norm(along, axis=-1)[:, None]
         normals, turned = _turn_right(along) / length, _turn_right(moved) / length[..., None]
         turned = turned - normals[..., None] * np.sum(normals[..., None] * turned, axis=1)[:, None]
-        return _Turned(points, self._slopes, normals, turned)
+        return Turned(points, self._slopes, normals, turned)
 
     def pose(self, unknowns: Unknowns) -> Posed:
         """Returns the body; its vertices lie on the spline."""
         shift = np.append(unknowns[:4], 0.0)
-        posed = _place(self.profile(unknowns), self._lathe, _AROUND_AXIS, self.axis, shift)
+        posed = place(self.profile(unknowns), self._lathe, _AROUND_AXIS, self.axis, shift)
         # A shift along the axis is an offset of the profile.
         return posed._replace(
             by_vertices=np.delete(posed.by_vertices, 4, axis=1),
@@ -246,7 +246,7 @@ class Revolution:
         return np.repeat([LARGEST_TURN, LARGEST_STEP * self._size], [2, 2 + _KNOTS])
 
 
-class _Turned(NamedTuple):
+class Turned(NamedTuple):
     """A profile and its derivatives by m unknowns.
 
     Attributes:
@@ -262,8 +262,8 @@ class _Turned(NamedTuple):
     by_normals: Float[np.ndarray, "points 2 m"]
 
 
-def _place(
-    turned: _Turned, connected: Lathe, azimuths: int, axis: Axis, pose: Float[np.ndarray, "5"]
+def place(
+    turned: Turned, connected: Lathe, azimuths: int, axis: Axis, pose: Float[np.ndarray, "5"]
 ) -> Posed:
     """Turns a profile around an axis that is tilted and shifted.
 

@@ -129,7 +129,8 @@ def test_the_profile_of_revolution(fitted):
     away, _ = KDTree(true).query(flat)
     assert np.sqrt(np.mean(away**2)) < 0.002
     assert away.max() < (0.01 if name == "cup" else 0.005)
-    assert KDTree(flat).query(true)[0].max() < 0.02
+    # Steps are up to 0.055 long where the profile is straight.
+    assert KDTree(flat).query(true)[0].max() < 0.03
     posed_surfaces.assert_closed(posed)
 
 
@@ -166,20 +167,22 @@ def _flat(vertices):
     return np.stack([np.linalg.norm(vertices[:, :2], axis=-1), vertices[:, 2]], axis=-1)
 
 
+@pytest.fixture(scope="module")
+def vase():
+    return fit_revolution(_body("vase")[0])
+
+
 @pytest.mark.parametrize("name", ["vase", "ring"])
-def test_revolution_as_a_shape(name):
-    mesh, _, _ = _body(name)
-    shape = fit_revolution(mesh)
+def test_revolution_as_a_shape(name, vase):
+    shape = vase if name == "vase" else fit_revolution(_body(name)[0])
     assert len(shape.start()) == 40
     posed_surfaces.assert_derivatives(shape)
     posed_surfaces.assert_prior(shape)
 
 
-def test_an_even_offset_moves_the_profile_along_its_normals():
-    mesh, _, _ = _body("vase")
-    shape = fit_revolution(mesh)
-    grown = shape.profile(np.append(np.zeros(4), np.full(36, 0.01)))
-    assert np.allclose(grown.points, shape.points + 0.01 * shape.directions, atol=1e-12)
+def test_an_even_offset_moves_the_profile_along_its_normals(vase):
+    grown = vase.profile(np.append(np.zeros(4), np.full(36, 0.01)))
+    assert np.allclose(grown.points, vase.points + 0.01 * vase.directions, atol=1e-12)
     # The poles stay on the axis, and the normals there along it.
     assert np.allclose(grown.points[[0, -1], 0], 0.0, atol=1e-12)
     assert np.allclose(grown.normals[[0, -1]], [[0.0, -1.0], [0.0, 1.0]], atol=1e-12)
@@ -279,18 +282,15 @@ def test_a_dented_box_is_no_convex_polyhedron():
     assert fit_polyhedron(dented) is None
 
 
-def test_candidates_are_ordered(ball, torus):
-    names = [shape.name for shape in candidates(ball)]
-    assert names == ["sphere", "surface of revolution", "free surface"]
+def test_candidates_are_ordered_and_near(ball, torus):
+    shapes = candidates(ball)
+    assert [shape.name for shape in shapes] == ["sphere", "surface of revolution", "free surface"]
+    for shape in shapes:
+        mesh = mesh_of(shape.pose(shape.start()))
+        assert np.abs(np.linalg.norm(mesh.vertices, axis=-1) - 1.3).max() < 0.002
     names = [shape.name for shape in candidates(torus)]
     assert names == ["torus", "surface of revolution", "free surface"]
     assert [shape.name for shape in candidates(bodies.fine_box())] == ["polyhedron", "free surface"]
-
-
-def test_all_candidates_of_a_ball_are_near_it(ball):
-    for shape in candidates(ball):
-        mesh = mesh_of(shape.pose(shape.start()))
-        assert np.abs(np.linalg.norm(mesh.vertices, axis=-1) - 1.3).max() < 0.002
 
 
 def test_an_inverted_mesh_is_refused(ball):
