@@ -42,7 +42,7 @@ _STEP = 1.0 / 600.0
 
 # Standard deviation of the smoothing along the profile: multiple of the error of the mesh,
 # between these shares of the diameter.
-_SMOOTHING = 4.0
+_SMOOTHING = 6.0
 _LEAST_SMOOTHING, _MOST_SMOOTHING = 0.0035, 0.017
 
 # Points of the mesh further from the profile than this share of the diameter do not correct it.
@@ -193,7 +193,7 @@ def fit_axis_and_profile(mesh: Mesh, cloud: Cloud, size: float, *, rounds: int =
     """Fits a surface of revolution: the axis and the profile in turn.
 
     A point of the half-plane is inside if more than half of its circle is inside the mesh. The
-    contour is smoothed along its length over four times the error of the mesh, but at least 0.35 %
+    contour is smoothed along its length over six times the error of the mesh, but at least 0.35 %
     and at most 1.7 % of the size, and then moved to the robust mean of the mesh over as much.
     Rounded rims of a smaller radius become as round as that.
 
