@@ -26,10 +26,11 @@ from refref_jax.choices import (
     Space,
     Tints,
 )
-from refref_jax.data import background_fit, scene_folder
+from refref_jax.data import background_fit, image_files, scene_folder
 from refref_jax.data.background_fit import Kind
 from refref_jax.data.mesh_queries import Containment, encloses, is_convex, winding_number
 from refref_jax.data.meshes import MeshPart
+from refref_jax.data.scene_folder import Frames
 from refref_jax.data.scene_properties import PartDescription, SceneProperties
 from refref_jax.geometry.cameras import Cameras, planar_directions
 from refref_jax.optics.interface_rules import NO_PARENT
@@ -244,25 +245,46 @@ def find_tints(
 
 
 def read_misfits(
-    scene: Path, parts: Sequence[MeshPart], *, space: Space, size: float, centre: Position
+    scene: Path,
+    parts: Sequence[MeshPart],
+    *,
+    space: Space,
+    size: float,
+    centre: Position,
+    masked: bool = False,
 ) -> float:
     """Returns the share of `misfits` of the training images, of which at most 60 are read.
+
+    Args:
+      scene: folder of the scene.
+      parts: meshes of the scene.
+      space: geometry of the background.
+      size: half edge of the cube, or radius of the sphere, world units.
+      centre: centre of the background, world units.
+      masked: whether the masks say where objects are, since the meshes are unknown.
 
     Raises:
       SceneError: if a file is missing or broken.
     """
-    cameras, images = _read_some(scene)
-    return misfits(cameras, images, parts, space=space, size=size, centre=centre)
+    frames, images = _read_some(scene)
+    among = image_files.well_outside(scene_folder.read_masks(frames)) if masked else None
+    return misfits(
+        frames.cameras, images, parts, space=space, size=size, centre=centre, among=among
+    )
 
 
-def _read_some(scene: Path) -> tuple[Cameras, UInt8[np.ndarray, "views h w 3"]]:
-    """Reads training images that are evenly spread, at most 60, and their cameras."""
+def _read_some(scene: Path) -> tuple[Frames, UInt8[np.ndarray, "views h w 3"]]:
+    """Returns training views that are evenly spread, at most 60, and their images."""
     frames = scene_folder.read_frames(scene, "train")
     count = len(frames.images)
     chosen = np.unique(np.linspace(0, count - 1, min(count, _MOST_IMAGES)).astype(int))
-    cameras = frames.cameras._replace(poses=frames.cameras.poses[chosen])
-    frames = frames._replace(images=tuple(frames.images[i] for i in chosen), cameras=cameras)
-    return cameras, scene_folder.read_images(frames)
+    masks = frames.masks and tuple(frames.masks[i] for i in chosen)
+    frames = frames._replace(
+        images=tuple(frames.images[i] for i in chosen),
+        masks=masks,
+        cameras=frames.cameras._replace(poses=frames.cameras.poses[chosen]),
+    )
+    return frames, scene_folder.read_images(frames)
 
 
 def size_in_images(
@@ -273,7 +295,8 @@ def size_in_images(
     Raises:
       SceneError: if a file is missing or broken.
     """
-    return fit_size_by_parallax(*_read_some(scene), parts, kind, centre=centre)
+    frames, images = _read_some(scene)
+    return fit_size_by_parallax(frames.cameras, images, parts, kind, centre=centre)
 
 
 def fit_size_by_parallax(
@@ -358,6 +381,7 @@ def misfits(
     space: Space,
     size: float,
     centre: Position = ORIGIN,
+    among: Bool[np.ndarray, "views h w"] | None = None,
 ) -> float:
     """Returns the share of patches of the images that see the background, but differ from it.
 
@@ -373,6 +397,7 @@ def misfits(
       space: geometry of the background.
       size: half edge of the cube, or radius of the sphere, world units.
       centre: centre of the background, world units.
+      among: mask of the pixels that may see the background; all by default.
 
     Returns:
       The share among the patches all of whose rays miss the boxes; 0 if there are none.
@@ -389,6 +414,8 @@ def misfits(
         cells.append(_cells(origin - np.array(centre), directions, space=space, size=size))
         direct.append(_misses(origin, directions, parts))
     cell, sees = np.concatenate(cells), np.concatenate(direct)
+    if among is not None:
+        sees &= among[:, row, column].reshape(-1)
     seen = photographs[:, row, column].reshape(-1, 3).T / 255.0
     number = np.maximum(np.bincount(cell[sees], minlength=6 * _CELLS**2), 1)
     means = [np.bincount(cell[sees], each[sees], len(number)) / number for each in seen]

@@ -268,6 +268,31 @@ def build(
     return bvh, primitive_ids.astype(np.int32)
 
 
+def filled_up(bvh: BVH) -> BVH:
+    """Returns the same tree with rows that are never read, up to round numbers.
+
+    The trees of a mesh that moves differ in size: with round numbers, programs that were compiled
+    for one of them serve all.
+    """
+    tables = _filled(bvh.nodes, axis=1)
+    added = np.arange(bvh_nodes.OCTANTS)[:, None] * (tables.shape[1] - bvh.nodes.shape[1])
+    tables[:, : bvh.nodes.shape[1] - 1, 6] += added.astype(np.int32)  # skip pointers count rows
+    triangles, facets = _filled(bvh.triangles), _filled(bvh.facets)
+    return BVH(host_array(tables), host_array(triangles), host_array(facets))
+
+
+def _filled(rows: np.ndarray, axis: int = 0) -> np.ndarray:
+    """Repeats the last row up to a round number of rows; that of a node table marks its end."""
+    count = rows.shape[axis]
+    last = np.take(rows, [count - 1] * spare_rows(count), axis=axis)
+    return np.concatenate([rows, last], axis=axis)
+
+
+def spare_rows(count: int) -> int:
+    """Returns how many rows `filled_up` adds to some."""
+    return -count % max(256, 1 << max(count.bit_length() - 3, 0))
+
+
 def _empty(dtype: np.dtype) -> BVH:
     """Returns a tree of one empty leaf."""
     point = np.zeros((1, 3), dtype)

@@ -29,6 +29,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
+from refref_jax.choices import Footprint
 from refref_jax.geometry.bvh import NO_PRIMITIVE, closest_primitive
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import media, path_step, ray_differentials
@@ -47,11 +48,25 @@ class _Segment(NamedTuple):
       state: state of the ray on the segment.
       medium: medium of the segment, known from the surface at its end, or else at its start.
       used: whether the path has this segment.
+      primitive: triangle at its end, `NO_PRIMITIVE` if there is none.
     """
 
     state: RayState
     medium: Int[Array, ""]
     used: Bool[Array, ""]
+    primitive: Int[Array, ""]
+
+
+class _Choice(NamedTuple):
+    """What is known in advance about one bend.
+
+    Attributes:
+      reflect: whether the reflected branch is followed.
+      primitive: triangle at the bend; `None` if it has to be searched.
+    """
+
+    reflect: Bool[Array, ""]
+    primitive: Int[Array, ""] | None
 
 
 class _Walk(NamedTuple):
@@ -80,6 +95,8 @@ def follow_branch(
     *,
     settings: PathSettings,
     interior_list: Int[Array, " slots"] | None = None,
+    footprint: Footprint = "cone",
+    primitives: Int[Array, " casts"] | None = None,
 ) -> LightPaths:
     """Traces one ray along one branch.
 
@@ -90,6 +107,9 @@ def follow_branch(
         reflections are always followed. All false is the main path.
       settings: path settings; `settings.max_bends` must be the length of `reflects`.
       interior_list: interior list of the camera, where rays carry one (see `media`).
+      footprint: `differential` carries derivatives across the pixel.
+      primitives: triangle at each bend and one more, as `find_primitives` returns them; searched by
+        default. With them, the scene's BVH may be that of another shape.
 
     Returns:
       One path. Its throughput is 0 if the path settings do not follow the branch, because its
@@ -115,6 +135,39 @@ def follow_branch(
       >>> print(f"{share:.4f} {slope:.4f}")
       0.9600 -0.1280
     """
+    end, segments, ray = _scan(scene, ray, reflects, settings, interior_list, footprint, primitives)
+    return _record(settings, ray, end, segments)
+
+
+def find_primitives(
+    scene: Scene, ray: Rays, reflects: Bool[Array, " bends"], *, settings: PathSettings
+) -> Int[Array, " casts"]:
+    """Returns the triangles that one branch of a ray meets, without gradients.
+
+    Args:
+      scene: the scene.
+      ray: one camera ray, outside all objects.
+      reflects: choice of branch at each bend, as in `follow_branch`.
+      settings: path settings.
+
+    Returns:
+      Triangle at each bend, and at the end of the last segment; `NO_PRIMITIVE` where the path does
+      not go on.
+    """
+    _, segments, _ = _scan(scene, ray, reflects, settings, None, "cone", None)
+    return jnp.where(segments.used, segments.primitive, NO_PRIMITIVE)
+
+
+def _scan(
+    scene: Scene,
+    ray: Rays,
+    reflects: Bool[Array, " bends"],
+    settings: PathSettings,
+    interior_list: Int[Array, " slots"] | None,
+    footprint: Footprint,
+    primitives: Int[Array, " casts"] | None,
+) -> tuple[_Walk, _Segment, Rays]:
+    """Returns the end and the segments of one branch, and the ray in the scene's precision."""
     if reflects.shape[0] != settings.max_bends:
         raise ValueError(
             f"reflects has {reflects.shape[0]} choices for {settings.max_bends} bends. Give one "
@@ -129,28 +182,30 @@ def follow_branch(
     if interior_list is None:
         interior_list = media.empty_interior_list(scene.interfaces)
     start = _Walk(
-        path_step.begin(ray, interior_list, ray_differentials.no_differential(ray.origins)),
+        path_step.begin(ray, interior_list, ray_differentials.begin(ray, footprint)),
         jnp.int32(media.AMBIENT),
         jnp.asarray(settings.max_bends > 0),
         jnp.int32(PathStatus.EMPTY),
         _no_stop(scene, ray),
     )
     # One step more than max bends: the last one only checks whether the path escapes.
-    choices = jnp.append(reflects, False)
+    choices = _Choice(jnp.append(reflects, False), primitives)
     advance = functools.partial(_advance, scene, settings)
     end, segments = jax.lax.scan(advance, start, choices)
-    return _record(settings, ray, end, segments)
+    return end, segments, ray
 
 
 def _advance(
-    scene: Scene, settings: PathSettings, walk: _Walk, reflect: Bool[Array, ""]
+    scene: Scene, settings: PathSettings, walk: _Walk, choice: _Choice
 ) -> tuple[_Walk, _Segment]:
     """Casts the ray, then ends the path or follows one of the two branches."""
     state, alive = walk.state, walk.status == PathStatus.EMPTY
-    limit = jnp.where(alive & walk.traced, jnp.inf, -1.0).astype(state.tau.dtype)
-    primitive_id = closest_primitive(
-        scene.surfaces.bvh, state.origin, state.direction, limit, state.exclude_primitive
-    )
+    reflect, primitive_id = choice
+    if primitive_id is None:
+        limit = jnp.where(alive & walk.traced, jnp.inf, -1.0).astype(state.tau.dtype)
+        primitive_id = closest_primitive(
+            scene.surfaces.bvh, state.origin, state.direction, limit, state.exclude_primitive
+        )
     hit = primitive_id != NO_PRIMITIVE
     arrival = path_step.arrive(scene, state, primitive_id)
     ended = jnp.where(
@@ -173,7 +228,8 @@ def _advance(
         ended_walk = _either(
             alive, walk._replace(state=ended_state, status=status, stop=stop), walk
         )
-    segment = _Segment(state, jnp.where(hit, sides.medium_near, walk.medium), alive)
+    medium = jnp.where(hit, sides.medium_near, walk.medium)
+    segment = _Segment(state, medium, alive, primitive_id)
     going_on = status == PathStatus.EMPTY
     return _either(going_on, bent, ended_walk), segment
 

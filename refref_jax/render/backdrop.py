@@ -42,7 +42,6 @@ from refref_jax.sampling.scene_bounds import Domain
 
 FACES = 6
 
-
 # Number of cells per side below which a level is not halved again.
 _COARSEST = 4
 
@@ -163,24 +162,36 @@ def _place(
     directions: Float[Array, "axes 3"],
 ) -> tuple[Int[Array, ""], Float[Array, "2"], Float[Array, "2 2"]]:
     """Returns a ray's face and its place there in `[-1, 1]`, with derivatives across the pixel."""
-    towards = _towards(domain, origin, direction)
+    towards = to_surface(domain, origin, direction)
     axis = jnp.argmax(jnp.abs(towards)).astype(jnp.int32)
     face = 2 * axis + (towards[axis] > 0.0).astype(jnp.int32)
 
-    def place(origin: Array, direction: Array) -> Array:
-        towards = _towards(domain, origin, direction, axis=axis)
-        major = jnp.abs(towards[axis])
-        others = jnp.stack([towards[(axis + 1) % 3], towards[(axis + 2) % 3]])
-        ratio = numerics.safe_divide(others, jnp.broadcast_to(major, others.shape))
-        return ratio if domain.space == "bounded" else (4.0 / jnp.pi) * jnp.arctan(ratio)
-
+    place = functools.partial(place_on_face, domain, axis)
     if points.shape[0] == 0:
         return face, place(origin, direction), jnp.zeros((2, 2), origin.dtype)
     at, push = jax.linearize(place, origin, direction)
     return face, at, jax.vmap(push)(points, directions)
 
 
-def _towards(
+def place_on_face(
+    domain: Domain, axis: Int[Array, ""], origin: Float[Array, "3"], direction: Float[Array, "3"]
+) -> Float[Array, "2"]:
+    """Returns where a ray meets a face of the surface, in `[-1, 1]` along both of its edges.
+
+    Args:
+      domain: scene bounds.
+      axis: axis of the face; of its two faces, the one ahead of the ray.
+      origin: origin of the ray, world units.
+      direction: unit direction of the ray.
+    """
+    towards = to_surface(domain, origin, direction, axis=axis)
+    major = jnp.abs(towards[axis])
+    others = jnp.stack([towards[(axis + 1) % 3], towards[(axis + 2) % 3]])
+    ratio = numerics.safe_divide(others, jnp.broadcast_to(major, others.shape))
+    return ratio if domain.space == "bounded" else (4.0 / jnp.pi) * jnp.arctan(ratio)
+
+
+def to_surface(
     domain: Domain,
     origin: Float[Array, "3"],
     direction: Float[Array, "3"],

@@ -148,6 +148,7 @@ def read(
     blocks: int = 2,
     share: float = 1.0,
     draw: int = 0,
+    among: Bool[np.ndarray, "views h w"] | None = None,
     progress: Callable[[int, int], None] = lambda view, total: None,
 ) -> tuple[Block, ...]:
     """Traces the training pixels, and returns their equations.
@@ -168,6 +169,7 @@ def read(
       blocks: number of blocks that the views are split into; they are traced and solved at once.
       share: share of the pixels, drawn at random.
       draw: number of the draw; another one draws other pixels.
+      among: mask of the pixels to read; all by default.
       progress: function called for each view, after the views that are traced with it; from several
         threads.
     """
@@ -191,6 +193,8 @@ def read(
     def trace(views: Int[np.ndarray, " views"]) -> Block:
         each: list[_Seen] = []
         drawn = _drawn(len(views) * photographs[0, ..., 0].size, share, (draw, int(views[0])))
+        if among is not None:
+            drawn &= among[views].reshape(-1)
         place = np.cumsum(drawn, dtype=np.int32) - 1
         for start in range(0, len(views), group):
             some = views[start : start + group]

@@ -13,10 +13,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
 
 from refref_jax import configuration
-from refref_jax.data import scene_folder
+from refref_jax.data import image_files, scene_folder
 from refref_jax.data.scene_folder import Frames
 from refref_jax.optics.scene import Scene
 from refref_jax.render import backdrop, pixels, volume_rendering
@@ -62,6 +62,7 @@ class _Problem(NamedTuple):
       scene: the scene.
       frames: training images and cameras.
       images: training images, 8-bit sRGB.
+      among: mask of the pixels that are fitted; `None` if all are.
       traced: function that is called for each view that is traced, and may interrupt.
     """
 
@@ -70,6 +71,7 @@ class _Problem(NamedTuple):
     scene: Scene
     frames: Frames
     images: UInt8[np.ndarray, "views h w 3"]
+    among: Bool[np.ndarray, "views h w"] | None
     traced: Callable[[int, int], None]
 
     @property
@@ -110,6 +112,7 @@ class _Problem(NamedTuple):
             fields=self._interiors(),
             share=self.share,
             draw=draw,
+            among=self.among,
             progress=self.traced,
         )
 
@@ -171,7 +174,10 @@ def _read(
             raise KeyboardInterrupt  # there is no new state to save
 
     frames = scene_folder.read_frames(folder, "train")
-    return _Problem(config, model, scene, frames, scene_folder.read_images(frames), traced)
+    images, among = scene_folder.read_images(frames), None
+    if config.scene.pixels == "background":
+        among = image_files.well_outside(scene_folder.read_masks(frames))
+    return _Problem(config, model, scene, frames, images, among, traced)
 
 
 def solve(

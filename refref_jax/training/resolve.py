@@ -138,7 +138,7 @@ def read_facts(scene: SceneConfig, *, parts: Sequence[MeshPart] | None = None) -
         told = dataclasses.replace(told, rule=None, parts={}, origins=known)
     else:
         parts = meshes.read_meshes(folder, indices=dict(scene.indices), properties=told)
-    rule = scene.rule or told.rule or "nested"
+    rule, masked = scene.rule or told.rule or "nested", scene.pixels == "background"
     given: dict[str, Any] = {"space": scene.space, "radius": scene.radius, "centre": scene.centre}
     tree = mesh_queries.find_containment(parts)
     notes = mesh_checks.check_meshes(parts, tree, rule=rule)
@@ -159,7 +159,7 @@ def read_facts(scene: SceneConfig, *, parts: Sequence[MeshPart] | None = None) -
         bounds.source,
         bounds.centre,
         f"background={scene.space}" if scene.space else _statement(folder, told),
-        functools.partial(scene_analysis.read_misfits, folder, parts),
+        functools.partial(scene_analysis.read_misfits, folder, parts, masked=masked),
     )
 
 
@@ -375,7 +375,6 @@ def _needs_of_a_field(config: TrainConfig, facts: SceneFacts) -> list[str]:
     needs = {
         "straight rays (paths=straight)": facts.analysis.parts > 0 and not config.paths.max_bends,
         "contraction=always": config.model.contraction == "always",
-        "pixels=background": config.scene.pixels == "background",
     }
     return [name for name, holds in needs.items() if holds]
 

@@ -1,0 +1,395 @@
+"""Fits shapes and indices of refraction to photographs of refracted light, by Gauss-Newton steps.
+
+A `Model` turns a vector of unknowns into a scene of nested dielectrics, with the derivatives of its
+vertices, normals, indices and tints. Each step draws fresh pixels, traces them through the scene as
+it is now, and solves
+
+    (J^T W J / s^2 + P + mu diag) dx = -J^T W r / s^2 - p
+
+for the change of the unknowns: `r` are errors of pixels in sRGB, `J` their derivatives, sparse ray
+by ray (`photometry`), `W` robust weights, `s` the typical error, and `P`, `p` the precision and the
+gradient of the prior. A step is taken if it explains other, fresh pixels better; otherwise `mu`
+grows. The backdrop is blurred at first, because a step can only find its way within the detail of
+what is seen through the object.
+
+The inverse of the matrix is the covariance of the unknowns: `Fit` has an error bar for each.
+
+Sources: Geman and McClure (1987), robust weights; Levenberg (1944) and Marquardt (1963), damping;
+Wu, Zhou, Qian, Gong, Huang: Full 3D Reconstruction of Transparent Objects (2018), for shape from
+refracted light; the sparse Jacobian through traced triangles is ours.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, Protocol
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse
+from jaxtyping import Float, Int
+
+from refref_jax.geometry.bvh import NO_PRIMITIVE
+from refref_jax.optics.media import Interfaces
+from refref_jax.reconstruct import ReconstructionError, photometry
+from refref_jax.reconstruct.photometry import Backdrop, Body, Photographs
+from refref_jax.reconstruct.shapes import Posed
+
+Matrix = Float[np.ndarray, "rows unknowns"] | scipy.sparse.csr_array
+"""A matrix of derivatives, dense or sparse."""
+
+# Errors of pixels beyond this, in sRGB, do not grow in the robust error.
+_CAP = 0.15
+
+# Smallest scale of the robust weights, in sRGB, and its ratio to the median error.
+_LEAST_SCALE, _SCALE = 0.02, 1.5
+
+# sRGB of saturated pixels, which may be brighter than they look.
+_SATURATED = 254.5 / 255.0
+
+# Linear RGB below which the slope of sRGB is held: dark noise would weigh most.
+_DARK = 2e-3
+
+# Pixels where less of the light was followed, or that end where fewer pixels saw the backdrop
+# directly, do not count.
+_FOLLOWED, _SEEN = 0.7, 0.5
+
+
+class Candidate(NamedTuple):
+    """A scene at given unknowns, and its derivatives.
+
+    Attributes:
+      parts: surfaces of the parts; their derivatives are by all unknowns.
+      interfaces: interfaces of the parts, under the rule `nested`.
+      by_indices: derivatives of the index of each part.
+      by_tints: derivatives of the logarithm of the tint of each part and channel.
+    """
+
+    parts: Sequence[Posed]
+    interfaces: Interfaces
+    by_indices: Matrix
+    by_tints: Matrix
+
+
+class Model(Protocol):
+    """What a vector of unknowns means."""
+
+    def start(self) -> Float[np.ndarray, " unknowns"]:
+        """Returns the unknowns to begin with."""
+
+    def pose(self, x: Float[np.ndarray, " unknowns"]) -> Candidate:
+        """Returns the scene at given unknowns."""
+
+    def prior(
+        self, x: Float[np.ndarray, " unknowns"]
+    ) -> tuple[Float[np.ndarray, "unknowns unknowns"], Float[np.ndarray, " unknowns"]]:
+        """Returns precision and gradient of the negative logarithm of the prior."""
+
+    def scales(self) -> Float[np.ndarray, " unknowns"]:
+        """Returns the largest change of each unknown in one step."""
+
+
+class Rows(NamedTuple):
+    """Further linear equations, such as those of outlines: `derivatives dx = -errors`.
+
+    Attributes:
+      errors: errors, in units of their standard deviation.
+      derivatives: their derivatives by the unknowns.
+      weights: robust weight of each.
+    """
+
+    errors: Float[np.ndarray, " rows"]
+    derivatives: Matrix
+    weights: Float[np.ndarray, " rows"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Steps:
+    """Settings of a fit.
+
+    Attributes:
+      blurs: blur of the backdrop in each step, as halvings of its resolution (`photometry.blurred`).
+      rays: number of pixels of a step.
+      judges: number of fresh pixels that decide whether a step is taken.
+      outliers: share of the pixels of largest derivatives that are left out.
+      least: largest change of an unknown, relative to its scale, below which the fit has ended.
+      seed: seed of the draws.
+    """
+
+    blurs: tuple[int, ...] = (2, 1, 0, 0, 0, 0)
+    rays: int = 40_000
+    judges: int = 8192
+    outliers: float = 0.01
+    least: float = 1e-3
+    seed: int = 0
+
+
+class StepFacts(NamedTuple):
+    """What one step did.
+
+    Attributes:
+      blur: halvings of the backdrop.
+      before: robust error of the fresh pixels before, sRGB.
+      after: the same after the step.
+      damping: damping of the step.
+      taken: whether the step was taken.
+      change: root mean square of the change, relative to the scales of the unknowns.
+    """
+
+    blur: int
+    before: float
+    after: float
+    damping: float
+    taken: bool
+    change: float
+
+
+class Fit(NamedTuple):
+    """Result of a fit.
+
+    Attributes:
+      x: unknowns.
+      covariance: their covariance; infinite errors are those of the prior.
+      steps: what the steps did.
+    """
+
+    x: Float[np.ndarray, " unknowns"]
+    covariance: Float[np.ndarray, "unknowns unknowns"]
+    steps: tuple[StepFacts, ...]
+
+
+class _Equations(NamedTuple):
+    """Normal equations of a linearisation, without the prior."""
+
+    matrix: Float[np.ndarray, "unknowns unknowns"]
+    gradient: Float[np.ndarray, " unknowns"]
+
+
+def body_of(candidate: Candidate) -> Body:
+    """Returns the scene of a candidate, on the device."""
+    parts = candidate.parts
+    return photometry.assemble(
+        np.concatenate([part.vertices[part.faces] for part in parts]),
+        np.concatenate([part.normals[part.normal_ids] for part in parts]),
+        np.repeat(np.arange(len(parts)), [len(part.faces) for part in parts]),
+        candidate.interfaces,
+    )
+
+
+def errors_of(
+    candidate: Candidate, surface: Backdrop, pixels: Photographs
+) -> Float[np.ndarray, " rays"]:
+    """Returns the robust error of each pixel in sRGB: root mean square of channels, capped."""
+    predicted = photometry.predict(body_of(candidate), surface, pixels.rays)
+    errors = np.sqrt(np.mean(photometry.residuals(predicted.linear, pixels.rgb) ** 2, axis=1))
+    return np.where(predicted.dropped < 1.0 - _FOLLOWED, np.minimum(errors, _CAP), _CAP)
+
+
+def fit(
+    model: Model,
+    x: Float[np.ndarray, " unknowns"],
+    surface: Backdrop,
+    pixels: Photographs,
+    *,
+    settings: Steps = Steps(),
+    outlines: Callable[[Candidate], Rows] | None = None,
+    progress: Callable[[int, StepFacts], None] | None = None,
+) -> Fit:
+    """Fits the unknowns of a model to photographs.
+
+    Args:
+      model: meaning of the unknowns.
+      x: unknowns to begin with.
+      surface: backdrop.
+      pixels: all pixels that may be drawn, none of which may judge the result.
+      settings: settings of the fit.
+      outlines: further equations at a candidate.
+      progress: called with the number of steps, and what the last one did.
+
+    Raises:
+      ReconstructionError: if there are no pixels.
+    """
+    if not len(pixels.views):
+        raise ReconstructionError("No pixel sees the object. Check the masks and the cameras.")
+    generator = np.random.default_rng(settings.seed)
+    draw = functools.partial(_draw, pixels, generator)
+    damping, facts = 1e-3, []
+    for number, blur in enumerate(settings.blurs):
+        seen = photometry.blurred(surface, blur)
+        candidate = model.pose(x)
+        light = _linearise(candidate, seen, draw(settings.rays), settings)
+        if outlines is not None:
+            light = _with_rows(light, outlines(candidate))
+        x, damping, fact = _step(
+            model, x, candidate, light, seen, draw(settings.judges), damping, blur
+        )
+        facts.append(fact)
+        if progress is not None:
+            progress(number + 1, fact)
+        if blur == 0 and fact.taken and fact.change < settings.least:
+            break
+    precision, _ = model.prior(x)
+    covariance = np.linalg.inv(light.matrix + precision)
+    return Fit(x, covariance, tuple(facts))
+
+
+def _draw(pixels: Photographs, generator: np.random.Generator, count: int) -> Photographs:
+    """Draws pixels without repetition."""
+    every = len(pixels.views)
+    return pixels.chosen(generator.choice(every, min(count, every), replace=False))
+
+
+def _step(
+    model: Model,
+    x: Float[np.ndarray, " unknowns"],
+    candidate: Candidate,
+    light: _Equations,
+    surface: Backdrop,
+    judges: Photographs,
+    damping: float,
+    blur: int,
+) -> tuple[Float[np.ndarray, " unknowns"], float, StepFacts]:
+    """Tries steps of growing damping until one explains the judges better."""
+    precision, pull = model.prior(x)
+    matrix, gradient = light.matrix + precision, light.gradient + pull
+    scales = model.scales()
+    before = float(errors_of(candidate, surface, judges).mean())
+    for _ in range(3):
+        damped = matrix + damping * np.diag(np.diag(light.matrix) + np.diag(precision))
+        change = -scipy.linalg.solve(damped, gradient, assume_a="pos")
+        change *= min(1.0, 1.0 / max(float(np.max(np.abs(change) / scales)), 1e-12))
+        after = float(errors_of(model.pose(x + change), surface, judges).mean())
+        rms = float(np.sqrt(np.mean((change / scales) ** 2)))
+        if after < before:
+            return (
+                x + change,
+                max(0.1 * damping, 1e-6),
+                StepFacts(blur, before, after, damping, True, rms),
+            )
+        damping = max(10.0 * damping, 1e-2)
+    return x, damping, StepFacts(blur, before, after, damping, False, rms)
+
+
+def _with_rows(light: _Equations, rows: Rows) -> _Equations:
+    """Returns the equations with further ones."""
+    weighted = scipy.sparse.diags_array(rows.weights) @ rows.derivatives
+    matrix = rows.derivatives.T @ weighted
+    dense = matrix.toarray() if scipy.sparse.issparse(matrix) else matrix
+    gradient = weighted.T @ rows.errors
+    return _Equations(light.matrix + dense, light.gradient + gradient)
+
+
+def _linearise(
+    candidate: Candidate, surface: Backdrop, pixels: Photographs, settings: Steps
+) -> _Equations:
+    """Returns the normal equations of some pixels."""
+    body = body_of(candidate)
+    predicted = photometry.predict(body, surface, pixels.rays)
+    found = photometry.sensitivities(body, surface, pixels.rays, predicted)
+    error = photometry.residuals(predicted.linear, pixels.rgb)
+    encode = 1.055 / 2.4 * np.maximum(predicted.linear, _DARK) ** (1.0 / 2.4 - 1.0)
+    slopes = found.slopes * encode[:, None]
+    coordinates = _by_unknowns(candidate, body, found)
+    counts = scipy.sparse.csr_array(np.repeat(found.crossings, 1, axis=0).astype(np.float64))
+    usable = found.usable & (predicted.dropped < 1.0 - _FOLLOWED) & (found.coverage > _SEEN)
+    weights = _robust_weights(error, usable)
+    weights = weights * _unsaturated(predicted.linear, pixels.rgb)
+    jacobian = _block_diagonal(np.swapaxes(slopes, 1, 2)) @ coordinates
+    if candidate.by_tints.shape[0]:
+        jacobian = jacobian + _by_tints(candidate, found.light * encode, counts)
+    weights *= _without_largest(jacobian, weights, settings.outliers)[:, None]
+    flat = weights.reshape(-1)
+    weighted = scipy.sparse.diags_array(flat) @ jacobian
+    squared = float(np.sum(flat * error.reshape(-1) ** 2) / max(np.sum(flat), 1.0))
+    matrix = jacobian.T @ weighted
+    dense = matrix.toarray() if scipy.sparse.issparse(matrix) else matrix
+    scale = max(squared, _LEAST_SCALE**2 / 16.0)
+    return _Equations(dense / scale, weighted.T @ error.reshape(-1) / scale)
+
+
+def _by_unknowns(
+    candidate: Candidate, body: Body, found: photometry.Sensitivities
+) -> Matrix:
+    """Returns the derivatives of the coordinates of all rays by the unknowns, ray-major."""
+    parts = candidate.parts
+    first = np.cumsum([0] + [len(part.vertices) for part in parts])
+    first_normal = np.cumsum([0] + [len(part.normals) for part in parts])
+    vertices = np.concatenate([p.faces + n for p, n in zip(parts, first, strict=False)])
+    normals = np.concatenate([p.normal_ids + n for p, n in zip(parts, first_normal, strict=False)])
+    ray, bend = np.nonzero(found.primitives != NO_PRIMITIVE)
+    face = body.faces[found.primitives[ray, bend]]
+    count = len(found.primitives)
+    total = _scattered(found.by_corners[ray, :, bend], ray, vertices[face], (count, first[-1]))
+    by = _stacked([part.by_vertices for part in parts])
+    total = total @ by
+    turned = _scattered(found.by_normals[ray, :, bend], ray, normals[face], (count, first_normal[-1]))
+    total = total + turned @ _stacked([part.by_normals for part in parts])
+    by_index = scipy.sparse.csr_array(found.by_indices.reshape(3 * count, -1).astype(np.float64))
+    return total + by_index @ candidate.by_indices
+
+
+def _scattered(
+    blocks: Float[np.ndarray, "bends 3 3 3"],
+    ray: Int[np.ndarray, " bends"],
+    columns: Int[np.ndarray, "bends 3"],
+    shape: tuple[int, int],
+) -> scipy.sparse.csr_array:
+    """Returns a sparse matrix `[3 rays, 3 columns]` of the blocks of coordinate, corner and axis."""
+    axes = np.arange(3, dtype=np.int32)
+    rows = 3 * ray[:, None, None, None].astype(np.int32) + axes[:, None, None]
+    places = 3 * columns[:, None, :, None].astype(np.int32) + axes
+    rows, places = np.broadcast_arrays(rows, places)
+    entries = (blocks.astype(np.float64).reshape(-1), (rows.reshape(-1), places.reshape(-1)))
+    return scipy.sparse.coo_array(entries, shape=(3 * shape[0], 3 * shape[1])).tocsr()
+
+
+def _stacked(matrices: Sequence[Matrix]) -> Matrix:
+    if len(matrices) == 1:
+        return matrices[0]
+    if any(scipy.sparse.issparse(each) for each in matrices):
+        return scipy.sparse.vstack([scipy.sparse.csr_array(each) for each in matrices]).tocsr()
+    return np.concatenate(matrices)
+
+
+def _block_diagonal(blocks: Float[np.ndarray, "rays 3 3"]) -> scipy.sparse.bsr_array:
+    count = len(blocks)
+    data = (blocks.astype(np.float64), np.arange(count), np.arange(count + 1))
+    return scipy.sparse.bsr_array(data, shape=(3 * count, 3 * count)).tocsr()
+
+
+def _by_tints(
+    candidate: Candidate, light: Float[np.ndarray, "rays 3"], counts: scipy.sparse.csr_array
+) -> Matrix:
+    """Returns the derivatives of the pixels by the logarithms of the tints."""
+    crossings = counts.toarray()
+    rows, parts = crossings.shape
+    blocks = crossings[:, None, :, None] * light[:, :, None, None] * np.eye(3)[None, :, None, :]
+    return blocks.reshape(3 * rows, 3 * parts) @ candidate.by_tints
+
+
+def _robust_weights(
+    error: Float[np.ndarray, "rays 3"], usable: np.ndarray
+) -> Float[np.ndarray, "rays 3"]:
+    """Returns Geman-McClure weights: pixels that something else explains lose theirs."""
+    size = np.sqrt(np.mean(error**2, axis=1))
+    scale = max(_LEAST_SCALE, _SCALE * float(np.median(size[usable]))) if usable.any() else 1.0
+    weight = usable / (1.0 + (size / scale) ** 2) ** 2
+    return np.repeat(weight[:, None], 3, axis=1)
+
+
+def _unsaturated(
+    linear: Float[np.ndarray, "rays 3"], rgb: Float[np.ndarray, "rays 3"]
+) -> np.ndarray:
+    return (rgb < _SATURATED) | (linear < 1.0)
+
+
+def _without_largest(
+    jacobian: Matrix, weights: Float[np.ndarray, "rays 3"], share: float
+) -> np.ndarray:
+    """Returns which rays do not have one of the largest derivatives, as near the critical angle."""
+    squares = jacobian.multiply(jacobian) if scipy.sparse.issparse(jacobian) else jacobian**2
+    size = np.asarray(squares.sum(axis=1)).reshape(-1, 3).sum(axis=1)
+    counted = weights[:, 0] > 0.0
+    if not counted.any():
+        return counted
+    return size <= np.quantile(size[counted], 1.0 - share)

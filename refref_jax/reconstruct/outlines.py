@@ -1,0 +1,160 @@
+"""Equations of the masks' outlines, for `gauss_newton`.
+
+Where the surface turns away from a camera, its image has an edge, and the edge of the mask should
+be there. A point of this rim that moves by `dx` moves its image across the edge by
+`d (signed distance) / d pixel . d pixel / d point . dx`; moving along the line of sight changes
+nothing. Masks are sampled at the centres of pixels, so the distance of a point has an error of about
+a third of a pixel. Masks that are wrong, or show something else, lose their weight.
+
+Source: Cipolla and Blake, Surface Shape from the Deformation of Apparent Contours (1992), for the
+derivative; its use beside refraction is ours.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse
+from jaxtyping import Float, Int
+
+from refref_jax.geometry.cameras import Cameras, project
+from refref_jax.geometry.triangle_meshes import unit_vectors
+from refref_jax.reconstruct.gauss_newton import Candidate, Rows
+from refref_jax.reconstruct.masks import Views, signed_distances
+from refref_jax.reconstruct.shapes import Posed
+
+# Standard deviation of a signed distance, and the distance at which a point has lost half of its
+# weight, in pixels; points that are further away are of an inner edge, which a mask does not show.
+_DEVIATION, _WRONG, _FURTHEST = 0.3, 1.0, 3.0
+
+# Largest number of rim points per view: neighbours have the same error, so more add nothing.
+_POINTS = 100
+
+
+class _Rim(NamedTuple):
+    """Points between two vertices, where the surface turns away from a camera.
+
+    Attributes:
+      first: vertex at one end.
+      second: vertex at the other end.
+      share: share of the second vertex.
+    """
+
+    first: Int[np.ndarray, " points"]
+    second: Int[np.ndarray, " points"]
+    share: Float[np.ndarray, " points"]
+
+
+class Outlines:
+    """The outlines of masks, as a function of a candidate to `Rows`."""
+
+    def __init__(self, views: Views, *, seed: int = 0) -> None:
+        """Measures the signed distances of all masks.
+
+        Args:
+          views: masks and their cameras.
+          seed: seed of the draws of rim points.
+        """
+        self._cameras, self._seed = views.cameras, seed
+        self._distances = [signed_distances(mask) for mask in views.masks]
+
+    def __call__(self, candidate: Candidate) -> Rows:
+        """Returns the equations of the outline of the first part, which contains all others."""
+        part = candidate.parts[0]
+        normals = _vertex_normals(part)
+        edges = _edges(part.faces)
+        generator = np.random.default_rng(self._seed)
+        found = [
+            self._of_view(view, part, normals, edges, generator)
+            for view in range(len(self._cameras.poses))
+        ]
+        errors = np.concatenate([each[0] for each in found])
+        derivatives = scipy.sparse.vstack([each[1] for each in found]).tocsr()
+        weights = 1.0 / (1.0 + (errors * _DEVIATION / _WRONG) ** 2) ** 2
+        return Rows(errors, derivatives @ part.by_vertices, weights)
+
+    def _of_view(
+        self,
+        view: int,
+        part: Posed,
+        normals: Float[np.ndarray, "vertices 3"],
+        edges: Int[np.ndarray, "edges 2"],
+        generator: np.random.Generator,
+    ) -> tuple[Float[np.ndarray, " points"], scipy.sparse.csr_array]:
+        """Returns errors and derivatives by the vertices of the rim of one view."""
+        pose, columns = self._cameras.poses[view], 3 * len(part.vertices)
+        rim = _rim(part.vertices, normals, edges, pose[:, 3])
+        share = rim.share[:, None]
+        points = (1.0 - share) * part.vertices[rim.first] + share * part.vertices[rim.second]
+        seen = project(points, pose, self._cameras)
+        distance, slope = _sample(self._distances[view], seen.pixels)
+        near = np.flatnonzero((np.abs(distance) < _FURTHEST) & (seen.depths > 0.0))
+        near = generator.permutation(near)[:_POINTS]
+        rows = _by_points(slope[near], seen.pixels[near], seen.depths[near], pose, self._cameras)
+        first, second = rim.first[near], rim.second[near]
+        blocks = np.concatenate([(1.0 - share[near]) * rows, share[near] * rows], axis=1)
+        at = 3 * np.stack([first, second], axis=1)[..., None] + np.arange(3)
+        row = np.repeat(np.arange(len(near)), 6)
+        entries = (blocks.ravel() / _DEVIATION, (row, at.ravel()))
+        matrix = scipy.sparse.coo_array(entries, shape=(len(near), columns)).tocsr()
+        return distance[near] / _DEVIATION, matrix
+
+
+def _vertex_normals(part: Posed) -> Float[np.ndarray, "vertices 3"]:
+    """Returns the mean of the corner normals at each vertex."""
+    at, each = part.faces.ravel(), part.normals[part.normal_ids.ravel()]
+    sums = [np.bincount(at, each[:, axis], len(part.vertices)) for axis in range(3)]
+    return unit_vectors(np.stack(sums, axis=-1))
+
+
+def _edges(faces: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, "edges 2"]:
+    """Returns each edge of a closed mesh once."""
+    both = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    return both[both[:, 0] < both[:, 1]]
+
+
+def _rim(
+    vertices: Float[np.ndarray, "vertices 3"],
+    normals: Float[np.ndarray, "vertices 3"],
+    edges: Int[np.ndarray, "edges 2"],
+    camera: Float[np.ndarray, "3"],
+) -> _Rim:
+    """Returns where the interpolated normals are perpendicular to the lines of sight."""
+    facing = np.sum(normals * (camera - vertices), axis=-1)
+    first, second = facing[edges[:, 0]], facing[edges[:, 1]]
+    turns = np.flatnonzero((first > 0.0) != (second > 0.0))
+    share = first[turns] / (first[turns] - second[turns])
+    return _Rim(edges[turns, 0], edges[turns, 1], share)
+
+
+def _sample(
+    image: Float[np.ndarray, "h w"], pixels: Float[np.ndarray, "points 2"]
+) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, "points 2"]]:
+    """Returns an image, whose values are at the centres of pixels, and its slope at points."""
+    height, width = image.shape
+    place = np.clip(pixels - 0.5, 0.0, [width - 1.001, height - 1.001])
+    column, row = place.astype(np.int64).T
+    right, down = (place - np.stack([column, row], axis=-1)).T
+    a, b = image[row, column], image[row, column + 1]
+    c, d = image[row + 1, column], image[row + 1, column + 1]
+    value = (1.0 - down) * ((1.0 - right) * a + right * b) + down * ((1.0 - right) * c + right * d)
+    along = (1.0 - down) * (b - a) + down * (d - c)
+    across = (1.0 - right) * (c - a) + right * (d - b)
+    return value, np.stack([along, across], axis=-1)
+
+
+def _by_points(
+    slope: Float[np.ndarray, "points 2"],
+    pixels: Float[np.ndarray, "points 2"],
+    depths: Float[np.ndarray, " points"],
+    pose: Float[np.ndarray, "3 4"],
+    cameras: Cameras,
+) -> Float[np.ndarray, "points 3"]:
+    """Returns the derivatives of the signed distance by a point in world units."""
+    middle = 0.5 * np.array([cameras.width, cameras.height])
+    x, y = (pixels - middle).T / cameras.focal
+    right, up, back = pose[:, 0], pose[:, 1], pose[:, 2]
+    scale = cameras.focal / depths
+    # A pixel is middle + focal (x, -y) / depth, and depth is along minus the third axis.
+    by_column = scale[:, None] * (right + x[:, None] * back)
+    by_row = scale[:, None] * (-up + y[:, None] * back)
+    return slope[:, :1] * by_column + slope[:, 1:] * by_row

@@ -1,0 +1,358 @@
+"""Compares photographs with the light of a known backdrop, refracted by an object of unknown shape.
+
+`predict` renders pixels along the whole path tree. `sensitivities` differentiates them: the main
+path of a pixel (refracted wherever it can be) carries the share `T` of its light and ends at a place
+`(u, v)` of the backdrop. With the three *coordinates* `(u, v, T)`,
+
+    d colour / d unknowns = (d colour / d coordinates) (d coordinates / d unknowns).
+
+The first factor is small: differences of the radiance over the pixel's own footprint, and, for `T`,
+the difference between the main path and the pixel's other light, which takes its share. The second
+is exact, and dense only in the corners and normals of the few triangles that the path meets.
+Nothing is ever differentiated through the whole mesh. The sequence of triangles is held fixed, as
+in `differentiable_paths`: a caller traces anew for every linearisation.
+
+This is one of the modules that call `jax.jit`.
+
+Source: ours. Igehy, Tracing Ray Differentials (1999), for the footprints.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from refref_jax import numerics
+from refref_jax.geometry import bvh_build
+from refref_jax.geometry.bvh import NO_PRIMITIVE
+from refref_jax.geometry.rays import Rays
+from refref_jax.geometry.surfaces import Surfaces
+from refref_jax.optics import light_paths, path_tracing
+from refref_jax.optics.differentiable_paths import find_primitives, follow_branch
+from refref_jax.optics.light_paths import PathStatus
+from refref_jax.optics.media import AMBIENT, INDEX_OF_AIR, Interfaces
+from refref_jax.optics.path_settings import TREE, PathSettings
+from refref_jax.optics.scene import Scene
+from refref_jax.render import backdrop, images, pixels
+from refref_jax.render.backdrop import Lookups, Mips
+from refref_jax.sampling.scene_bounds import Domain
+
+MAIN = PathSettings(max_bends=8, reflections="all", min_throughput=TREE.min_throughput)
+"""The main path: 8 bends are enough for 99 % of the pixels of a torus or of a filled flask."""
+
+# Number of rays traced at once (the same for any number of rays: one compilation), and largest number of taps along each axis of a footprint.
+_TILE = 8192
+_TAPS = 3
+
+# Half the width of the difference that gives the slope of the radiance, in cells of the resolution
+# read: the slope over the cells that the pixel averages, not that of one bilinear patch.
+_HALF_WIDTH = 0.5
+
+# Light beside the main path that is below this share has no colour of its own.
+_LITTLE = 0.01
+
+_Tree = TypeVar("_Tree")
+
+
+class Backdrop(NamedTuple):
+    """A known backdrop.
+
+    Attributes:
+      domain: its kind, size and place.
+      mips: its radiance at all resolutions, fine to coarse (`backdrop.mipmap`).
+      coverage: number of pixels that see each vertex, at the same resolutions, in three channels.
+    """
+
+    domain: Domain
+    mips: Mips
+    coverage: Mips
+
+    @property
+    def resolution(self) -> int:
+        """Number of cells per side of a face."""
+        return self.mips[0].shape[1] - 1
+
+
+class Photographs(NamedTuple):
+    """Pixels of photographs that see the object.
+
+    Attributes:
+      rays: rays of the pixels.
+      rgb: sRGB of the pixels, in `[0, 1]`.
+      views: view of each pixel.
+    """
+
+    rays: Rays
+    rgb: Float[np.ndarray, "rays 3"]
+    views: Int[np.ndarray, " rays"]
+
+    def chosen(self, some: Int[np.ndarray, " some"]) -> "Photographs":
+        """Returns some of the pixels."""
+        return jax.tree.map(lambda x: numerics.host_array(np.asarray(x)[some]), self)
+
+
+class Body(NamedTuple):
+    """A scene on the device, and the faces that its primitives are.
+
+    Attributes:
+      scene: the scene; its parts are nested dielectrics.
+      faces: face of each primitive, counted over all parts.
+    """
+
+    scene: Scene
+    faces: Int[np.ndarray, " primitives"]
+
+
+class Prediction(NamedTuple):
+    """Predicted pixels.
+
+    Attributes:
+      linear: linear RGB.
+      dropped: share of the light that was not followed.
+    """
+
+    linear: Float[np.ndarray, "rays 3"]
+    dropped: Float[np.ndarray, " rays"]
+
+
+class Sensitivities(NamedTuple):
+    """Derivatives of pixels, as factors; see the module.
+
+    Attributes:
+      primitives: triangle at each bend of the main path, `NO_PRIMITIVE` where it has none.
+      by_corners: derivatives of the coordinates by the corners of these triangles, per world unit.
+      by_normals: derivatives of the coordinates by their normals.
+      by_indices: derivatives of the coordinates by the index of refraction of each part.
+      slopes: derivatives of the pixel's linear RGB by the coordinates.
+      light: linear RGB that the main path contributes.
+      crossings: number of times that the main path meets each part.
+      coverage: number of pixels that see the backdrop where the path ends.
+      usable: whether the path leaves the object within the number of bends.
+    """
+
+    primitives: Int[np.ndarray, "rays bends"]
+    by_corners: Float[np.ndarray, "rays 3 bends 3 3"]
+    by_normals: Float[np.ndarray, "rays 3 bends 3 3"]
+    by_indices: Float[np.ndarray, "rays 3 parts"]
+    slopes: Float[np.ndarray, "rays 3 3"]
+    light: Float[np.ndarray, "rays 3"]
+    crossings: Int[np.ndarray, "rays parts"]
+    coverage: Float[np.ndarray, " rays"]
+    usable: np.ndarray
+
+
+def assemble(
+    corners: Float[np.ndarray, "faces 3 3"],
+    normals: Float[np.ndarray, "faces 3 3"],
+    parts: Int[np.ndarray, " faces"],
+    interfaces: Interfaces,
+) -> Body:
+    """Returns a scene of triangles, on the device.
+
+    Args:
+      corners: corners of all faces, world units.
+      normals: outward unit shading normals at these corners.
+      parts: part of each face.
+      interfaces: interfaces of the parts, under the rule `nested`.
+    """
+    bvh, order = bvh_build.build(corners.astype(np.float32))
+    order = np.append(order, np.repeat(order[-1:], bvh_build.spare_rows(len(order))))
+    packed = Surfaces(
+        bvh_build.filled_up(bvh),
+        numerics.host_array(normals[order].astype(np.float32)),
+        numerics.host_array(parts[order].astype(np.int32)),
+        numerics.host_array(np.zeros((0, 3, 3), np.float32)),
+    )
+    return Body(jax.device_put(Scene(packed, interfaces)), order)
+
+
+def blurred(surface: Backdrop, halvings: int) -> Backdrop:
+    """Returns a backdrop that is blurred by about `0.58 * 2**halvings` of its cells.
+
+    Args:
+      surface: the backdrop.
+      halvings: number of times that the resolution is halved before it is interpolated again.
+    """
+    if not halvings:
+        return surface
+    mips = surface.mips
+    halvings = min(halvings, len(mips) - 1)
+    levels = [jnp.zeros_like(mip) for mip in mips]
+    levels[halvings] = mips[halvings]
+    pyramid = tuple(reversed(levels))
+    return surface._replace(mips=_mipmap(pyramid, space=surface.domain.space))
+
+
+_mipmap = jax.jit(backdrop.mipmap, static_argnames="space")
+
+
+def predict(body: Body, surface: Backdrop, rays: Rays) -> Prediction:
+    """Renders pixels along the whole path tree, with one ray and its footprint each."""
+
+    def render(part: Rays) -> Prediction:
+        return _predict(
+            body.scene,
+            surface.mips,
+            part,
+            domain=surface.domain,
+            resolution=surface.resolution,
+        )
+
+    return _in_tiles(render, rays)
+
+
+def sensitivities(
+    body: Body, surface: Backdrop, rays: Rays, predicted: Prediction
+) -> Sensitivities:
+    """Differentiates pixels by the corners, normals and indices that their main paths meet."""
+
+    def differentiate(part: Rays) -> tuple[Sensitivities, Array, Array]:
+        return _differentiate(
+            body.scene,
+            surface.mips,
+            surface.coverage,
+            part,
+            domain=surface.domain,
+            resolution=surface.resolution,
+        )
+
+    found, radiance, share = _in_tiles(differentiate, rays)
+    share = share[:, None]
+    light = share * radiance
+    others = (predicted.linear - light) / np.maximum(1.0 - share, _LITTLE)
+    by_share = np.where(1.0 - share > _LITTLE, radiance - others, 0.0)
+    slopes = np.concatenate([found.slopes, by_share[:, None]], axis=1)
+    return found._replace(slopes=slopes, light=light)
+
+
+def residuals(
+    predicted: Float[np.ndarray, "rays 3"], rgb: Float[np.ndarray, "rays 3"]
+) -> Float[np.ndarray, "rays 3"]:
+    """Returns the errors of predicted pixels in sRGB."""
+    return np.asarray(_encode(predicted), np.float64) - rgb
+
+
+_encode = jax.jit(lambda linear: jnp.clip(pixels.linear_to_srgb(linear), 0.0, 1.0))
+
+
+def _in_tiles(render: Callable[[Rays], _Tree], rays: Rays) -> _Tree:
+    """Returns the results for all rays, as NumPy arrays."""
+    count = rays.radii.shape[0]
+    found = []
+    for start in range(0, count, _TILE):
+        part, _ = images.crop(rays, None, start, _TILE)
+        kept = min(_TILE, count - start)
+        found.append(jax.tree.map(lambda x, n=kept: np.asarray(x)[:n], render(part)))
+    return images.join(found)
+
+
+@functools.partial(jax.jit, static_argnames=("domain", "resolution"))
+def _predict(
+    scene: Scene, mips: Mips, rays: Rays, *, domain: Domain, resolution: int
+) -> Prediction:
+    count = rays.radii.shape[0]
+    traced = path_tracing.trace_ends(scene, rays, settings=TREE, footprint="differential")
+    ends = traced.ends
+    throughput = jnp.where(light_paths.exists(ends)[:, None], ends.throughput, 0.0)
+    ends = ends._replace(throughput=throughput)
+    lookups = backdrop.locate(domain, ends, ends.rays, resolution=resolution, most_taps=_TAPS)
+    linear = backdrop.colours(mips, lookups, pixels=count)
+    return Prediction(linear, jnp.max(traced.dropped, axis=-1))
+
+
+@functools.partial(jax.jit, static_argnames=("domain", "resolution"))
+def _differentiate(
+    scene: Scene, mips: Mips, coverage: Mips, rays: Rays, *, domain: Domain, resolution: int
+) -> tuple[Sensitivities, Array, Array]:
+    """Returns the sensitivities, and the radiance and the share of the main path."""
+    ahead = jnp.zeros(MAIN.max_bends, bool)
+    primitives = jax.vmap(lambda ray: find_primitives(scene, ray, ahead, settings=MAIN))(rays)
+    replay = functools.partial(_replay, scene, domain)
+    triangles = scene.surfaces.bvh.triangles[primitives]
+    normals = scene.surfaces.normals[primitives]
+    parts = scene.surfaces.parts[primitives]
+    indices = scene.interfaces.index_inside
+    by = jax.jacrev(replay, argnums=(0, 1, 2), has_aux=True)
+    (by_corners, by_normals, by_indices), ends = jax.vmap(by, in_axes=(0, 0, None, 0, 0, 0))(
+        triangles, normals, indices, parts, primitives, rays
+    )
+    count = rays.radii.shape[0]
+    numbers = jnp.arange(count, dtype=jnp.int32)
+    lookups = backdrop.locate(domain, ends, numbers, resolution=resolution, most_taps=_TAPS)
+    slopes = _slopes(mips, lookups) * ends.throughput[:, None]
+    radiance = backdrop.radiance(mips, lookups)
+    met = primitives[:, :-1] != NO_PRIMITIVE
+    kinds = jnp.arange(indices.shape[0], dtype=jnp.int32)
+    crossings = jnp.sum((parts[:, :-1, None] == kinds) & met[..., None], axis=1, dtype=jnp.int32)
+    cut = lambda x: x[:, :, :-1]  # noqa: E731 - the last cast meets nothing
+    found = Sensitivities(
+        primitives=primitives[:, :-1],
+        by_corners=cut(by_corners),
+        by_normals=cut(by_normals),
+        by_indices=by_indices,
+        slopes=slopes,
+        light=radiance,
+        crossings=crossings,
+        coverage=backdrop.radiance(coverage, lookups)[:, 0],
+        usable=ends.statuses == PathStatus.ESCAPED,
+    )
+    return found, radiance, jnp.mean(ends.throughput, axis=-1)
+
+
+def _replay(
+    scene: Scene,
+    domain: Domain,
+    corners: Float[Array, "casts 3 3"],
+    normals: Float[Array, "casts 3 3"],
+    indices: Float[Array, " parts"],
+    parts: Int[Array, " casts"],
+    primitives: Int[Array, " casts"],
+    ray: Rays,
+) -> tuple[Float[Array, "3"], light_paths.PathEnds]:
+    """Returns the coordinates of the main path of one ray, through the triangles given."""
+    bvh = scene.surfaces.bvh._replace(triangles=corners)
+    surfaces = scene.surfaces._replace(bvh=bvh, normals=normals, parts=parts)
+    local = Scene(surfaces, with_indices(scene.interfaces, indices))
+    casts = jnp.arange(primitives.shape[0], dtype=jnp.int32)
+    path = follow_branch(
+        local,
+        ray,
+        jnp.zeros(MAIN.max_bends, bool),
+        settings=MAIN,
+        footprint="differential",
+        primitives=jnp.where(primitives == NO_PRIMITIVE, NO_PRIMITIVE, casts),
+    )
+    one = jax.tree.map(lambda x: x[None], path)
+    ends = jax.tree.map(lambda x: x[0], light_paths.ends_of(one))
+    towards = jax.lax.stop_gradient(backdrop.to_surface(domain, ends.origins, ends.directions))
+    axis = jnp.argmax(jnp.abs(towards)).astype(jnp.int32)
+    place = backdrop.place_on_face(domain, axis, ends.origins, ends.directions)
+    share = jnp.mean(ends.throughput, keepdims=True)
+    return jnp.append(place, share), jax.lax.stop_gradient(ends)
+
+
+def with_indices(interfaces: Interfaces, indices: Float[Array, " parts"]) -> Interfaces:
+    """Returns the interfaces of nested dielectrics with other indices, in air."""
+    around = indices[jnp.maximum(interfaces.medium_outside - 1, 0)]
+    outside = jnp.where(interfaces.medium_outside == AMBIENT, INDEX_OF_AIR, around)
+    return interfaces._replace(index_inside=indices, index_outside=outside.astype(indices.dtype))
+
+
+def _slopes(mips: Mips, lookups: Lookups) -> Float[Array, "rays 2 3"]:
+    """Returns the derivatives of the radiance by the place on the face."""
+    sides = lookups.sides.astype(lookups.starts.dtype)
+
+    def along(axis: int) -> Float[Array, "rays 3"]:
+        shift = _HALF_WIDTH * jnp.eye(2, dtype=lookups.starts.dtype)[axis]
+        there, here = (
+            backdrop.radiance(mips, lookups._replace(starts=lookups.starts + sign * shift))
+            for sign in (1.0, -1.0)
+        )
+        # A face is two units and as many cells wide as it has sides.
+        return (there - here) * (0.5 * sides / (2.0 * _HALF_WIDTH))[:, None]
+
+    return jnp.stack([along(0), along(1)], axis=1)
