@@ -12,9 +12,12 @@ gradient of the prior. A step is taken if it explains other, fresh pixels better
 grows. The backdrop is blurred at first, because a step can only find its way within the detail of
 what is seen through the object.
 
-The inverse of the matrix is the covariance of the unknowns: `Fit` has an error bar for each.
+The inverse of the matrix is the covariance of the unknowns, if errors of pixels are independent.
+Those of one view are not: a backdrop that is a little off shifts them alike. The scatter of the
+gradients of whole views says by how much the covariance is too small.
 
 Sources: Geman and McClure (1987), robust weights; Levenberg (1944) and Marquardt (1963), damping;
+Liang and Zeger (1986), covariance from clusters of errors, here views;
 Wu, Zhou, Qian, Gong, Huang: Full 3D Reconstruction of Transparent Objects (2018), for shape from
 refracted light; the sparse Jacobian through traced triangles is ours.
 """
@@ -41,8 +44,9 @@ Matrix = Float[np.ndarray, "rows unknowns"] | scipy.sparse.csr_array
 # Errors of pixels beyond this, in sRGB, do not grow in the robust error.
 _CAP = 0.15
 
-# Smallest scale of the robust weights, in sRGB, and its ratio to the median error.
-_LEAST_SCALE, _SCALE = 0.02, 1.5
+# Smallest scale of the robust weights, in sRGB, and its ratio to the median error; smallest typical
+# error, near the rounding of 8 bits.
+_LEAST_SCALE, _SCALE, _LEAST_NOISE = 0.02, 1.5, 0.005
 
 # sRGB of saturated pixels, which may be brighter than they look.
 _SATURATED = 254.5 / 255.0
@@ -149,7 +153,7 @@ class Fit(NamedTuple):
 
     Attributes:
       x: unknowns.
-      covariance: their covariance; infinite errors are those of the prior.
+      covariance: their covariance: that of the prior where light says nothing.
       steps: what the steps did.
     """
 
@@ -157,12 +161,24 @@ class Fit(NamedTuple):
     covariance: Float[np.ndarray, "unknowns unknowns"]
     steps: tuple[StepFacts, ...]
 
+    @property
+    def taken(self) -> int:
+        """Number of steps that were taken."""
+        return sum(step.taken for step in self.steps)
+
 
 class _Equations(NamedTuple):
-    """Normal equations of a linearisation, without the prior."""
+    """Normal equations of a linearisation, without the prior.
+
+    Attributes:
+      matrix: `J^T W J / s^2`.
+      gradient: `J^T W r / s^2`.
+      by_view: the share of each view in the gradient of the pixels.
+    """
 
     matrix: Float[np.ndarray, "unknowns unknowns"]
     gradient: Float[np.ndarray, " unknowns"]
+    by_view: Float[np.ndarray, "views unknowns"]
 
 
 def body_of(candidate: Candidate) -> Body:
@@ -229,8 +245,7 @@ def fit(
         if blur == 0 and fact.taken and fact.change < settings.least:
             break
     precision, _ = model.prior(x)
-    covariance = np.linalg.inv(light.matrix + precision)
-    return Fit(x, covariance, tuple(facts))
+    return Fit(x, _covariance(light, precision), tuple(facts))
 
 
 def _draw(pixels: Photographs, generator: np.random.Generator, count: int) -> Photographs:
@@ -276,7 +291,7 @@ def _with_rows(light: _Equations, rows: Rows) -> _Equations:
     matrix = rows.derivatives.T @ weighted
     dense = matrix.toarray() if scipy.sparse.issparse(matrix) else matrix
     gradient = weighted.T @ rows.errors
-    return _Equations(light.matrix + dense, light.gradient + gradient)
+    return light._replace(matrix=light.matrix + dense, gradient=light.gradient + gradient)
 
 
 def _linearise(
@@ -290,21 +305,39 @@ def _linearise(
     encode = 1.055 / 2.4 * np.maximum(predicted.linear, _DARK) ** (1.0 / 2.4 - 1.0)
     slopes = found.slopes * encode[:, None]
     coordinates = _by_unknowns(candidate, body, found)
-    counts = scipy.sparse.csr_array(np.repeat(found.crossings, 1, axis=0).astype(np.float64))
     usable = found.usable & (predicted.dropped < 1.0 - _FOLLOWED) & (found.coverage > _SEEN)
     weights = _robust_weights(error, usable)
     weights = weights * _unsaturated(predicted.linear, pixels.rgb)
     jacobian = _block_diagonal(np.swapaxes(slopes, 1, 2)) @ coordinates
     if candidate.by_tints.shape[0]:
-        jacobian = jacobian + _by_tints(candidate, found.light * encode, counts)
+        jacobian = jacobian + _by_tints(candidate, found.light * encode, found.crossings)
     weights *= _without_largest(jacobian, weights, settings.outliers)[:, None]
     flat = weights.reshape(-1)
     weighted = scipy.sparse.diags_array(flat) @ jacobian
     squared = float(np.sum(flat * error.reshape(-1) ** 2) / max(np.sum(flat), 1.0))
     matrix = jacobian.T @ weighted
     dense = matrix.toarray() if scipy.sparse.issparse(matrix) else matrix
-    scale = max(squared, _LEAST_SCALE**2 / 16.0)
-    return _Equations(dense / scale, weighted.T @ error.reshape(-1) / scale)
+    scale = max(squared, _LEAST_NOISE**2)
+    by_ray = np.arange(3 * len(error)) // 3
+    each = scipy.sparse.csr_array(
+        (error.reshape(-1) / scale, (pixels.views[by_ray], 3 * by_ray + np.arange(by_ray.size) % 3)),
+        shape=(int(pixels.views.max()) + 1, by_ray.size),
+    )
+    by_view = each @ weighted
+    by_view = by_view.toarray() if scipy.sparse.issparse(by_view) else by_view
+    return _Equations(dense / scale, by_view.sum(axis=0), by_view)
+
+
+def _covariance(
+    light: _Equations, precision: Float[np.ndarray, "unknowns unknowns"]
+) -> Float[np.ndarray, "unknowns unknowns"]:
+    """Returns the covariance of the unknowns, with errors of a view that are alike."""
+    inverse = np.linalg.inv(light.matrix + precision)
+    views = light.by_view - light.by_view.mean(axis=0)
+    scatter = np.sum((views @ inverse) ** 2, axis=0)
+    independent = np.einsum("ij,jk,ki->i", inverse, light.matrix, inverse)
+    alike = float(np.median(scatter / np.maximum(independent, 1e-300)))
+    return inverse * max(1.0, alike)
 
 
 def _by_unknowns(
@@ -358,10 +391,11 @@ def _block_diagonal(blocks: Float[np.ndarray, "rays 3 3"]) -> scipy.sparse.bsr_a
 
 
 def _by_tints(
-    candidate: Candidate, light: Float[np.ndarray, "rays 3"], counts: scipy.sparse.csr_array
+    candidate: Candidate,
+    light: Float[np.ndarray, "rays 3"],
+    crossings: Int[np.ndarray, "rays parts"],
 ) -> Matrix:
     """Returns the derivatives of the pixels by the logarithms of the tints."""
-    crossings = counts.toarray()
     rows, parts = crossings.shape
     blocks = crossings[:, None, :, None] * light[:, :, None, None] * np.eye(3)[None, :, None, :]
     return blocks.reshape(3 * rows, 3 * parts) @ candidate.by_tints

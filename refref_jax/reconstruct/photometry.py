@@ -233,10 +233,12 @@ def residuals(
     predicted: Float[np.ndarray, "rays 3"], rgb: Float[np.ndarray, "rays 3"]
 ) -> Float[np.ndarray, "rays 3"]:
     """Returns the errors of predicted pixels in sRGB."""
-    return np.asarray(_encode(predicted), np.float64) - rgb
+    return encode(predicted) - rgb
 
 
-_encode = jax.jit(lambda linear: jnp.clip(pixels.linear_to_srgb(linear), 0.0, 1.0))
+def encode(linear: Float[np.ndarray, "rays 3"]) -> Float[np.ndarray, "rays 3"]:
+    """Returns linear RGB as sRGB in `[0, 1]`."""
+    return np.asarray(jnp.clip(pixels.linear_to_srgb(jnp.asarray(linear)), 0.0, 1.0), np.float64)
 
 
 def _in_tiles(render: Callable[[Rays], _Tree], rays: Rays) -> _Tree:

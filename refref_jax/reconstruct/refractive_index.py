@@ -242,7 +242,7 @@ def estimate_index(
     """
     if not len(views):
         raise ReconstructionError("No pixel sees the object. Check the masks and the cameras.")
-    rungs = _rungs(search)
+    ladder = rungs(search)
     show = _counter(progress, most_looks(search, start=start))
 
     def errors(index: float) -> Float[np.ndarray, " rays"]:
@@ -260,7 +260,7 @@ def estimate_index(
         raise ReconstructionError(
             "No error of a pixel is finite. Check the field that the pixels are compared with."
         )
-    starts = [rungs[i] for i in _lowest_rungs(heights, search.descents)]
+    starts = [rungs[i] for i in lowest_rungs(heights, search.descents)]
     starts += [] if start is None else [start]
     ways = [descend(slope, at, search) for at in starts]
     ways.sort(key=lambda way: way.errors[-1] if math.isfinite(way.errors[-1]) else math.inf)
@@ -273,7 +273,7 @@ def estimate_index(
 def most_looks(search: IndexSearch, *, start: float | None = None) -> int:
     """Returns the largest number of evaluations of the error."""
     descents = search.descents + (start is not None)
-    return len(_rungs(search)) + search.most * descents + len(_PARABOLA)
+    return len(rungs(search)) + search.most * descents + len(_PARABOLA)
 
 
 def descend(
@@ -325,12 +325,12 @@ def scatter_of_bottoms(
     return float(bottoms.std(ddof=1) / math.sqrt(groups))
 
 
-def _rungs(search: IndexSearch) -> tuple[float, ...]:
+def rungs(search: IndexSearch) -> tuple[float, ...]:
     count = math.ceil((search.highest - search.lowest) / search.spacing - 1e-9)
     return tuple(float(rung) for rung in np.linspace(search.lowest, search.highest, count + 1))
 
 
-def _lowest_rungs(heights: Sequence[float], count: int) -> list[int]:
+def lowest_rungs(heights: Sequence[float], count: int) -> list[int]:
     """Returns the lowest rungs, but no two adjacent ones, which would share a valley."""
     chosen: list[int] = []
     for rung in np.argsort(np.where(np.isfinite(heights), heights, np.inf), kind="stable"):

@@ -11,17 +11,29 @@ import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-import jax
 import numpy as np
 import scipy.sparse
-from jaxtyping import Float
+from jaxtyping import Float, Int
+from trimesh import Trimesh
+from trimesh.remesh import subdivide_to_size
 
-from refref_jax.geometry.triangle_meshes import Mesh
+from refref_jax.geometry.triangle_meshes import Mesh, diameter, make_mesh
 from refref_jax.optics.interface_rules import NO_PARENT, nested
-from refref_jax.reconstruct import ReconstructionError, gauss_newton, photometry
+from refref_jax.reconstruct import ReconstructionError, families, gauss_newton, photometry
 from refref_jax.reconstruct.gauss_newton import Candidate, Fit, Matrix, Rows, StepFacts, Steps
 from refref_jax.reconstruct.photometry import Backdrop, Photographs
-from refref_jax.reconstruct.shapes import Posed, Shape, mesh_of
+from refref_jax.reconstruct.refractive_index import (
+    Descent,
+    IndexEstimate,
+    IndexSearch,
+    lowest_rungs,
+    rungs,
+    scatter_of_bottoms,
+)
+from refref_jax.reconstruct.shapes import FixedShape, FreeSurface, Posed, Shape, mesh_of
+from refref_jax.reconstruct.smoothing import diffuse
+
+Outlines = Callable[[Candidate], Rows]
 
 # Standard deviation of the prior of an index that was found for the mesh from masks, and largest
 # change in one step.
@@ -29,6 +41,28 @@ _INDEX_DEVIATION, _INDEX_STEP = 0.02, 0.02
 
 # The same of the logarithm of a tint.
 _TINT_DEVIATION, _TINT_STEP = 1.0, 0.3
+
+# Pixels of a look at one index, blur of the backdrop for these, and of the steps from the best.
+_LOOK, _LOOK_BLUR, _INDEX_BLURS = 8192, 2, (2, 1, 0, 0)
+
+# Half-width of the parabola for the standard error of an index.
+_APART = 0.002
+
+# Lengths over which a free surface is smoothed before each group of steps: noise that the handles
+# cannot remove; world units of a body of diameter 2.6. Steps of each group, without blur.
+_SMOOTHINGS, _GROUPS = (0.05, 0.02, 0.02), (2, 2, 2)
+
+# Steps of families with few unknowns, without blur, and the pixels of each.
+_FAMILY_STEPS, _FAMILY_RAYS = 4, 20_000
+
+# A blur is enough if errors are at most this many times what the blur alone adds.
+_ENOUGH = 2.5
+
+# Longest edge of a mesh whose vertices are to be moved, as a share of its diameter.
+_LONGEST = 0.015
+
+# Lengths are stated for bodies of this diameter, world units.
+_STATED_FOR = 2.6
 
 
 class SingleObject:
@@ -107,3 +141,255 @@ def _widened(matrix: Matrix, columns: int) -> Matrix:
         return np.concatenate([matrix, np.zeros((matrix.shape[0], columns))], axis=1)
     nothing = scipy.sparse.csr_array((matrix.shape[0], columns))
     return scipy.sparse.hstack([matrix, nothing]).tocsr()
+
+
+def find_index(
+    mesh: Mesh,
+    surface: Backdrop,
+    pixels: Photographs,
+    *,
+    search: IndexSearch = IndexSearch(),
+    start: float | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    seed: int = 0,
+) -> IndexEstimate:
+    """Estimates the index of refraction of an object of known shape.
+
+    The error of few pixels is looked at on a ladder of indices, before a blurred backdrop, whose
+    valleys are wide. Gauss-Newton steps with ever less blur begin at the best rungs.
+
+    Args:
+      mesh: mesh of the object.
+      surface: backdrop.
+      pixels: pixels that see the object.
+      search: ladder, and number of rungs from which to begin.
+      start: index that the user expects, from which steps begin, too.
+      progress: called with the number of looks and steps done, and their number.
+      seed: seed of the draws.
+
+    Raises:
+      ReconstructionError: if there are no pixels.
+    """
+    if not len(pixels.views):
+        raise ReconstructionError("No pixel sees the object. Check the masks and the cameras.")
+    few = pixels.chosen(_spread(len(pixels.views), _LOOK, seed))
+    seen = photometry.blurred(surface, _LOOK_BLUR)
+    ladder = rungs(search)
+    total = len(ladder) + (search.descents + (start is not None)) * len(_INDEX_BLURS) + 3
+    heights = []
+    for number, rung in enumerate(ladder):
+        heights.append(float(_errors_at(mesh, rung, seen, few).mean()))
+        progress(number + 1, total)
+    starts = [ladder[i] for i in lowest_rungs(heights, search.descents)]
+    starts += [] if start is None else [start]
+    settings = Steps(_INDEX_BLURS, rays=_LOOK, judges=_LOOK, seed=seed)
+    ways = []
+    for number, begin in enumerate(starts):
+        model = SingleObject(FixedShape(mesh), begin, deviation=search.spacing)
+        found = gauss_newton.fit(model, model.start(), surface, pixels, settings=settings)
+        index = min(max(model.index_of(found.x), search.lowest), search.highest)
+        error = float(_errors_at(mesh, index, surface, few).mean())
+        ways.append(Descent((begin, index), (found.steps[0].before, error)))
+        progress(len(ladder) + (number + 1) * len(_INDEX_BLURS), total)
+    ways.sort(key=lambda way: way.errors[-1])
+    best = ways[0].indices[-1]
+    many = pixels.chosen(_spread(len(pixels.views), 4 * _LOOK, seed))
+    triple = [_errors_at(mesh, best + side * _APART, surface, many) for side in (-1.0, 0.0, 1.0)]
+    deviation = scatter_of_bottoms(np.stack(triple), many.views, _APART)
+    progress(total, total)
+    ladder_seen = Descent(ladder, tuple(heights))
+    return IndexEstimate(best, deviation, ways[0].errors[-1], ladder_seen, tuple(ways))
+
+
+def _spread(every: int, count: int, seed: int) -> Int[np.ndarray, " some"]:
+    """Draws some of many."""
+    return np.random.default_rng((seed, count)).choice(every, min(every, count), replace=False)
+
+
+def _errors_at(
+    mesh: Mesh, index: float, surface: Backdrop, pixels: Photographs
+) -> Float[np.ndarray, " rays"]:
+    model = SingleObject(FixedShape(mesh), index)
+    return gauss_newton.errors_of(model.pose(model.start()), surface, pixels)
+
+
+class Trial(NamedTuple):
+    """One model, fitted.
+
+    Attributes:
+      name: kind of its shape.
+      model: the model.
+      fit: its unknowns, their covariance, and what the steps did.
+      by_view: mean robust error of the judges of each view, sRGB.
+    """
+
+    name: str
+    model: SingleObject
+    fit: Fit
+    by_view: Float[np.ndarray, " views"]
+
+    @property
+    def error(self) -> float:
+        """Mean error of the judges."""
+        return float(self.by_view.mean())
+
+    @property
+    def index(self) -> float:
+        """Index of refraction."""
+        return self.model.index_of(self.fit.x)
+
+    @property
+    def mesh(self) -> Mesh:
+        """The surface."""
+        return self.model.mesh(self.fit.x)
+
+
+def fit_shapes(
+    mesh: Mesh,
+    index: float,
+    surface: Backdrop,
+    pixels: Photographs,
+    judges: Photographs,
+    *,
+    deviation: float = _INDEX_DEVIATION,
+    outlines: Outlines | None = None,
+    seed: int = 0,
+    progress: Callable[[str, int, StepFacts | None], None] = lambda name, step, facts: None,
+) -> tuple[Trial, ...]:
+    """Fits the families that come near a mesh to photographs, the fewest unknowns first.
+
+    The first trial is the mesh as it is. The free surface begins at the better of the mesh and the
+    best family.
+
+    Args:
+      mesh: mesh of the object, from masks.
+      index: its index of refraction, as far as it is known.
+      surface: backdrop.
+      pixels: pixels to fit.
+      judges: other pixels.
+      deviation: standard deviation of the index; 0 keeps it.
+      outlines: equations of the masks' outlines.
+      seed: seed of the draws.
+      progress: called with the name of the shape, the number of steps, and what the last one did.
+    """
+    fixed = SingleObject(FixedShape(mesh), index, deviation=deviation)
+    nothing = Fit(fixed.start(), np.full((1, 1), deviation**2), ())
+    trials = [Trial("masks", fixed, nothing, _by_view(fixed.pose(nothing.x), surface, judges))]
+    blur = first_blur(fixed.pose(nothing.x), surface, judges)
+    family = Steps((*range(blur, 0, -1), *[0] * _FAMILY_STEPS), rays=_FAMILY_RAYS, seed=seed)
+    *few, free = families.candidates(mesh)
+    for shape in few:
+        model = SingleObject(shape, index, deviation=deviation)
+        report = _named(progress, shape.name)
+        fit = gauss_newton.fit(
+            model, model.start(), surface, pixels, settings=family, outlines=outlines,
+            progress=report,
+        )
+        trials.append(Trial(shape.name, model, fit, _by_view(model.pose(fit.x), surface, judges)))
+    best = min(trials, key=lambda trial: trial.error)
+    trials.append(
+        _fit_free(best, surface, pixels, judges, outlines, deviation, seed,
+                  blur if best is trials[0] else 0, _named(progress, free.name))
+    )
+    return tuple(trials)
+
+
+def _named(
+    progress: Callable[[str, int, StepFacts | None], None], name: str
+) -> Callable[[int, StepFacts], None]:
+    return lambda step, facts: progress(name, step, facts)
+
+
+def _fit_free(
+    start: Trial,
+    surface: Backdrop,
+    pixels: Photographs,
+    judges: Photographs,
+    outlines: Outlines | None,
+    deviation: float,
+    seed: int,
+    blur: int,
+    progress: Callable[[int, StepFacts], None],
+) -> Trial:
+    """Fits a free surface, from the mesh of masks or from a family."""
+    mesh, index, done = _with_many_vertices(start.mesh), start.index, 0
+    from_masks = start.name == "masks"
+    smoothings = _SMOOTHINGS if from_masks else (0.0,)
+    for number, smoothing in enumerate(smoothings):
+        if smoothing:
+            mesh = diffuse(mesh, smoothing * diameter(mesh.vertices) / _STATED_FOR)
+        model = SingleObject(FreeSurface(mesh), index, deviation=deviation)
+        coarse = tuple(range(blur, 0, -1)) if number == 0 else ()
+        settings = Steps((*coarse, *[0] * _GROUPS[number]), seed=seed + number)
+        fit = gauss_newton.fit(
+            model, model.start(), surface, pixels, settings=settings, outlines=outlines,
+            progress=lambda step, facts, before=done: progress(before + step, facts),
+        )
+        done += len(settings.blurs)
+        mesh, index = model.mesh(fit.x), model.index_of(fit.x)
+    return Trial(model.shape.name, model, fit, _by_view(model.pose(fit.x), surface, judges))
+
+
+def _with_many_vertices(mesh: Mesh) -> Mesh:
+    """Returns a mesh with short edges, since only vertices can move."""
+    corners = mesh.vertices[mesh.faces]
+    edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)
+    longest = _LONGEST * diameter(mesh.vertices)
+    if edges.max() <= 4.0 * longest:
+        return mesh
+    found = Trimesh(*subdivide_to_size(mesh.vertices, mesh.faces, longest, max_iter=30))
+    found.merge_vertices()
+    return make_mesh(np.asarray(found.vertices), np.asarray(found.faces, np.int64))
+
+
+def _by_view(
+    candidate: Candidate, surface: Backdrop, judges: Photographs
+) -> Float[np.ndarray, " views"]:
+    """Returns the mean error of each view that has judges."""
+    errors = gauss_newton.errors_of(candidate, surface, judges)
+    _, views = np.unique(judges.views, return_inverse=True)
+    return np.bincount(views, errors) / np.bincount(views)
+
+
+def choose(trials: Sequence[Trial]) -> Trial:
+    """Returns the trial of fewest unknowns that is not worse than the best by two standard errors.
+
+    The error of the difference is that of its mean over views.
+    """
+    best = min(trials, key=lambda trial: trial.error)
+    for trial in sorted(trials, key=lambda trial: len(trial.fit.x)):
+        difference = trial.by_view - best.by_view
+        error = difference.std(ddof=1) / math.sqrt(len(difference)) if len(difference) > 1 else 0.0
+        if difference.mean() <= 2.0 * error:
+            return trial
+    return best
+
+
+def first_blur(candidate: Candidate, surface: Backdrop, pixels: Photographs) -> int:
+    """Returns the least blur of the backdrop at which steps find their way, in halvings.
+
+    A blur alone makes errors, since photographs are not blurred. Where the shape is so wrong that
+    light ends beyond the detail of the backdrop, errors are many times larger.
+    """
+    body = gauss_newton.body_of(candidate)
+    sharp = photometry.predict(body, surface, pixels.rays).linear
+    most = len(surface.mips) - 2
+    for halvings in range(1, most + 1):
+        seen = photometry.predict(body, photometry.blurred(surface, halvings), pixels.rays).linear
+        added = np.abs(photometry.residuals(seen, photometry.encode(sharp))).mean()
+        error = np.abs(photometry.residuals(seen, pixels.rgb)).mean()
+        if error <= _ENOUGH * added:
+            return halvings - 1 if halvings == 1 else halvings
+    return most
+
+
+def normal_deviations(
+    trial: Trial,
+) -> Float[np.ndarray, " normals"]:
+    """Returns the standard deviation of each normal of the shape, in degrees."""
+    posed = trial.model.pose(trial.fit.x).parts[0]
+    spread = posed.by_normals @ trial.fit.covariance
+    by = posed.by_normals
+    both = by.multiply(spread) if scipy.sparse.issparse(by) else by * spread
+    variance = np.asarray(both.sum(axis=1)).reshape(-1, 3).sum(axis=1)
+    return np.degrees(np.sqrt(np.maximum(variance, 0.0)))

@@ -411,3 +411,40 @@ def independent_prior(
 def rms(values: np.ndarray, weights: np.ndarray) -> float:
     """Returns the root of the weighted mean square."""
     return float(np.sqrt(np.sum(weights * values**2) / np.sum(weights)))
+
+
+class FixedShape:
+    """A mesh without unknowns, as for a search of its index alone.
+
+    Attributes:
+      name: kind of the shape.
+      mesh: the mesh.
+    """
+
+    name = "as it is"
+
+    def __init__(self, mesh: Mesh) -> None:
+        """Takes the mesh."""
+        self.mesh = mesh
+
+    def start(self) -> Unknowns:
+        """Returns no unknowns."""
+        return np.zeros(0)
+
+    def pose(self, unknowns: Unknowns) -> Posed:
+        """Returns the mesh; each corner has its own normal."""
+        del unknowns
+        mesh = self.mesh
+        ids = np.arange(3 * len(mesh.faces)).reshape(-1, 3)
+        normals = mesh.normals.reshape(-1, 3)
+        nothing = csr_array((3 * len(mesh.vertices), 0)), csr_array((3 * len(normals), 0))
+        return Posed(mesh.vertices, mesh.faces, normals, ids, *nothing)
+
+    def prior(self, unknowns: Unknowns) -> tuple[Matrix, Unknowns]:
+        """Returns nothing."""
+        del unknowns
+        return np.zeros((0, 0)), np.zeros(0)
+
+    def scales(self) -> Unknowns:
+        """Returns nothing."""
+        return np.zeros(0)
