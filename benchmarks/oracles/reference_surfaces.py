@@ -93,13 +93,17 @@ def _flat(corners: np.ndarray) -> np.ndarray:
 
 
 def _smooth(corners: np.ndarray) -> np.ndarray:
-    """Returns the mean of the normals around a vertex, each weighted by its angle there."""
-    along = unit(np.roll(corners, -1, axis=1) - corners)
-    back = unit(np.roll(corners, 1, axis=1) - corners)
-    angles = np.arccos(np.clip(np.sum(along * back, axis=-1), -1.0, 1.0))
+    """Returns the mean of the normals around a vertex, with Max's weights.
+
+    Unlike the library's, they do not keep large flat pieces flat.
+    """
+    along = np.roll(corners, -1, axis=1) - corners
+    back = np.roll(corners, 1, axis=1) - corners
+    areas = np.linalg.norm(np.cross(along, back), axis=-1)
+    weights = areas / np.sum(along**2, axis=-1) / np.sum(back**2, axis=-1)
     _, vertices = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
     sums = np.zeros((vertices.max() + 1, 3))
-    weighted = angles[..., None] * face_normals(corners)[:, None]
+    weighted = weights[..., None] * face_normals(corners)[:, None]
     np.add.at(sums, vertices.ravel(), weighted.reshape(-1, 3))
     return unit(sums[vertices.ravel()]).reshape(corners.shape)
 

@@ -1,11 +1,12 @@
 """Closed triangle meshes: their shading normals, measures and connected pieces (NumPy only).
 
 Neighbouring faces whose normals differ by less than the crease angle belong to one smooth patch.
-At a corner, the face normals of a patch are averaged, weighted by the angle of each face there.
-Normals are not averaged across a crease, so a cube stays flat and a cylinder keeps its rim.
+At a corner, the face normals of a patch are averaged with Max's weights, which are exact where all
+vertices lie on a sphere. Normals are not averaged across a crease, so a cube stays flat and a
+cylinder keeps its rim. Large flat pieces with a narrow bevel keep their normal up to their rim.
 
-Source: Thuermer and Wuethrich, Computing Vertex Normals from Polygonal Facets (1998), for the
-weighting by angle.
+Source: N. Max, Weights for Computing Vertex Normals from Facet Normals (1999); Thuermer and
+Wuethrich, Computing Vertex Normals from Polygonal Facets (1998), for `corner_angles`.
 """
 
 from collections.abc import Sequence
@@ -22,6 +23,26 @@ CREASE_ANGLE = np.radians(30.0)
 # A face is degenerate if its area is below this fraction of its longest edge squared, as happens
 # when single-precision files put three corners on one line.
 _DEGENERATE = 1e-6
+
+# Edges shorter than this share of the longest side of the mesh's box lose weight with the fourth
+# power of their length. Rounding to single precision turns a face with an edge of a tenth of it by
+# 0.4 degrees.
+_SHORTEST = 1e-4
+
+# Faces that meet at a smaller angle, in radians, are one flat piece. Single precision turns faces
+# by less, unless they are tiny.
+_COPLANAR = 1e-4
+
+# Pieces of at least this share of the area of the largest piece at a corner are its peers.
+_PEER = 0.3
+
+# A flat piece determines normals at its rim if all pieces there that are not its peers have at most
+# the second share of its area. From the first share on, it has no more weight than others.
+_RIM = (0.2, 0.1)
+
+# Largest angle between a face at a corner and the average by angle up to which that holds, radians.
+# From the second angle on, where smoothing has crossed a right angle, faces are weighted by angle.
+_STEEP = np.radians((30.0, 45.0))
 
 Vertices = Float[np.ndarray, "vertices 3"]
 Faces = Int[np.ndarray, "faces 3"]
@@ -47,13 +68,69 @@ def corner_normals(
     flat = face_normals(corners)
     if crease_angle <= 0.0:
         return np.repeat(flat[:, None], 3, axis=1)
-    group = smooth_groups(vertices, faces, crease_angle=crease_angle).reshape(-1)
-    weighted = (_corner_angles(corners)[..., None] * flat[:, None]).reshape(-1, 3)
-    sums = np.stack([np.bincount(group, weighted[:, axis]) for axis in range(3)], axis=-1)
-    averaged = unit_vectors(sums)[group].reshape(-1, 3, 3)
-    # Opposite faces may cancel at a corner: fall back to the face normal there.
+    groups = smooth_groups(vertices, faces, crease_angle=crease_angle)
+    weights = corner_weights(corners)
+    curved = average_normals(flat, groups, weights)
+    large, share = _large_pieces(corners, faces, groups)
+    pinned = average_normals(flat, groups, weights * large)
+    by_angle = average_normals(flat, groups, corner_angles(corners))
+    steep = _steepness(flat, groups, by_angle)[..., None]
+    normals = _between(_between(curved, pinned, share[..., None]), by_angle, steep)
+    # Where opposite normals cancel, one of them remains.
+    return np.where(np.any(normals != 0.0, axis=-1, keepdims=True), normals, by_angle)
+
+
+def corner_weights(corners: Float[np.ndarray, "faces 3 3"]) -> Float[np.ndarray, "faces 3"]:
+    """Returns the weight of each face's unit normal at each of its corners.
+
+    It is the sine of the angle there, divided by the lengths of both edges. Around a vertex that
+    lies on a sphere with its neighbours, the average is the normal of the sphere.
+
+    Tiny edges, whose faces rounding has turned, lose weight. Degenerate faces have weights, but no
+    normals.
+
+    Source: N. Max, Weights for Computing Vertex Normals from Facet Normals (1999).
+
+    Returns:
+      Weights without a unit: lengths are shares of the longest side of the box around all corners.
+    """
+    size = np.max(np.ptp(corners.reshape(-1, 3), axis=0)) if corners.size else 0.0
+    edges = np.roll(corners, -1, axis=1) - corners
+    lengths = np.linalg.norm(edges, axis=-1) / (size or 1.0)
+    damped = np.minimum(1.0, lengths / _SHORTEST) ** 4
+    factors = np.divide(damped, lengths, out=np.zeros_like(lengths), where=lengths > 0.0)
+    forward = unit_vectors(edges)
+    sines = np.linalg.norm(np.cross(forward, np.roll(forward, 1, axis=1)), axis=-1)
+    return sines * factors * np.roll(factors, 1, axis=1)
+
+
+def corner_angles(corners: Float[np.ndarray, "faces 3 3"]) -> Float[np.ndarray, "faces 3"]:
+    """Returns the angle of each face at each of its corners, in radians."""
+    forward = unit_vectors(np.roll(corners, -1, axis=1) - corners)
+    backward = unit_vectors(np.roll(corners, 1, axis=1) - corners)
+    return np.arccos(np.clip(np.sum(forward * backward, axis=-1), -1.0, 1.0))
+
+
+def average_normals(
+    normals: Float[np.ndarray, "faces 3"],
+    groups: Int[np.ndarray, "faces 3"],
+    weights: Float[np.ndarray, "faces 3"],
+) -> Float[np.ndarray, "faces 3 3"]:
+    """Returns the unit vector along the weighted sum of face normals over each group of corners.
+
+    Where the sum is zero, because opposite faces cancel, it is the face's own normal.
+
+    Args:
+      normals: unit normals of the faces; zero for degenerate ones.
+      groups: numbers of the groups, from `smooth_groups`.
+      weights: not negative; only their ratios within a group matter.
+    """
+    at = groups.reshape(-1)
+    weighted = (weights[..., None] * normals[:, None]).reshape(-1, 3)
+    sums = np.stack([np.bincount(at, weighted[:, axis]) for axis in range(3)], axis=-1)
+    averaged = unit_vectors(sums)[at].reshape(-1, 3, 3)
     cancelled = np.all(averaged == 0.0, axis=-1, keepdims=True)
-    return np.where(cancelled, flat[:, None], averaged)
+    return np.where(cancelled, normals[:, None], averaged)
 
 
 def smooth_groups(
@@ -88,33 +165,88 @@ def unit_vectors(vectors: Float[np.ndarray, "*shape 3"]) -> Float[np.ndarray, "*
     return np.divide(vectors, norm, out=np.zeros_like(vectors), where=norm > 0.0)
 
 
+def _large_pieces(
+    corners: Float[np.ndarray, "faces 3 3"],
+    faces: Int[np.ndarray, "faces 3"],
+    groups: Int[np.ndarray, "faces 3"],
+) -> tuple[Bool[np.ndarray, "faces 3"], Float[np.ndarray, "faces 3"]]:
+    """Returns which corners belong to a large flat piece, and how far these alone decide.
+
+    Max's weights favour small faces. Where a large lid meets a narrow bevel, they give the normal
+    of the bevel, which bends the shading of the whole lid, while the true normal at the rim of a
+    rounded edge is the lid's. Faces in one plane are a piece. Those that are about as large as the
+    largest at a corner, its peers, decide if they have at least two faces, and if other pieces all
+    along their rims are much smaller. On curved surfaces, pieces are single faces or have such
+    neighbours. Peers, such as the strips of a cylinder, are averaged with Max's weights.
+
+    Returns:
+      Whether a corner belongs to a peer, and the share of peers in the normal at each corner.
+    """
+    areas = 0.5 * np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1
+    )
+    piece = _smooth_patches(faces, face_normals(corners), _COPLANAR)[:, None].repeat(3, axis=1)
+    size = np.bincount(piece[:, 0], areas)[piece]
+    single = np.bincount(piece[:, 0])[piece] == 1
+    peer = size >= _PEER * _largest(groups, size)
+    other = _largest(groups, np.where(single | ~peer, size, 0.0))
+    ratio = np.divide(other, size, out=np.ones_like(size), where=size > 0.0)
+    worst = _largest(piece, np.where(peer, ratio, 0.0))
+    # The worst of the peers at a corner.
+    worst = np.maximum(_largest(groups, np.where(peer, worst, 0.0)), _RIM[1])
+    return peer, np.clip(np.log(worst / _RIM[0]) / np.log(_RIM[1] / _RIM[0]), 0.0, 1.0)
+
+
+def _steepness(
+    flat: Float[np.ndarray, "faces 3"],
+    groups: Int[np.ndarray, "faces 3"],
+    normals: Float[np.ndarray, "faces 3 3"],
+) -> Float[np.ndarray, "faces 3"]:
+    """Returns how far faces are too steep at a corner for weights that may favour one: 0 to 1.
+
+    Max's weights assume a small part of a sphere. Smoothed across its right angles, the long sides
+    of a rod would have normals that lie nearly in their planes, which cannot shade them.
+    """
+    # Half the chord between normals is the sine of half their angle; degenerate faces have none.
+    chord = np.linalg.norm(flat[:, None] - normals, axis=-1) * np.any(flat != 0.0, axis=1)[:, None]
+    angle = 2.0 * np.arcsin(np.minimum(0.5 * _largest(groups, chord), 1.0))
+    return np.clip((angle - _STEEP[0]) / (_STEEP[1] - _STEEP[0]), 0.0, 1.0)
+
+
+def _between(
+    first: Float[np.ndarray, "faces 3 3"],
+    second: Float[np.ndarray, "faces 3 3"],
+    share: Float[np.ndarray, "faces 3 1"],
+) -> Float[np.ndarray, "faces 3 3"]:
+    """Returns unit vectors between others; the first are not changed where the share is 0."""
+    return np.where(share > 0.0, unit_vectors((1.0 - share) * first + share * second), first)
+
+
+def _largest(
+    groups: Int[np.ndarray, "faces 3"], values: Float[np.ndarray, "faces 3"]
+) -> Float[np.ndarray, "faces 3"]:
+    """Returns the largest value, not negative, in each corner's group."""
+    found = np.zeros(groups.max(initial=0) + 1)
+    np.maximum.at(found, groups, values)
+    return found[groups]
+
+
 def _smooth_patches(
     faces: Int[np.ndarray, "faces 3"],
     normals: Float[np.ndarray, "faces 3"],
     crease_angle: float,
 ) -> Int[np.ndarray, " faces"]:
     """Numbers the patches of faces that are connected across smooth edges."""
-    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    owner = np.repeat(np.arange(len(faces)), 3)
-    order = np.lexsort((edges[:, 1], edges[:, 0]))
-    edges, owner = edges[order], owner[order]
-    shared = np.all(edges[1:] == edges[:-1], axis=1)
-    first, second = owner[:-1][shared], owner[1:][shared]
-    cosine = np.sum(normals[first] * normals[second], axis=1)
+    first, second, _ = neighbours(faces)
     solid = np.any(normals != 0.0, axis=1)
-    smooth = (cosine > np.cos(crease_angle)) & solid[first] & solid[second]
+    # Cosines of tiny angles are 1 up to rounding; chords are accurate.
+    chord = np.linalg.norm(normals[first] - normals[second], axis=1)
+    smooth = (chord < 2.0 * np.sin(0.5 * crease_angle)) & solid[first] & solid[second]
     graph = coo_array(
         (np.ones(smooth.sum(), bool), (first[smooth], second[smooth])),
         shape=(len(faces), len(faces)),
     )
     return connected_components(graph, directed=False)[1]
-
-
-def _corner_angles(corners: Float[np.ndarray, "faces 3 3"]) -> Float[np.ndarray, "faces 3"]:
-    """Returns the angle of each face at each of its corners, in radians."""
-    forward = unit_vectors(np.roll(corners, -1, axis=1) - corners)
-    backward = unit_vectors(np.roll(corners, 1, axis=1) - corners)
-    return np.arccos(np.clip(np.sum(forward * backward, axis=-1), -1.0, 1.0))
 
 
 class Mesh(NamedTuple):
@@ -132,7 +264,7 @@ class Mesh(NamedTuple):
 
 
 def make_mesh(vertices: Vertices, faces: Faces, *, crease_angle: float = CREASE_ANGLE) -> Mesh:
-    """Returns a mesh with normals averaged by angle, but not across creases (radians)."""
+    """Returns a mesh with averaged normals, but not across creases (radians)."""
     return Mesh(vertices, faces, corner_normals(vertices, faces, crease_angle=crease_angle))
 
 

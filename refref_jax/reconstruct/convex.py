@@ -83,8 +83,8 @@ def weigh_facets(mesh: Mesh, *, crease_angle: float = CREASE_ANGLE) -> Mesh:
     """Returns a mesh of few corners with normals that are averaged by the areas of flat facets.
 
     Suppose that a large flat lid meets a narrow bevel at less than the crease angle. An average
-    weighted by angle would tilt the normals of the entire lid. Weighted by area, the normals vary
-    on the bevel instead.
+    that favours the bevel would tilt the normals of the entire lid. Weighted by area, the normals
+    vary on the bevel instead, however wide it is.
 
     Args:
       mesh: convex mesh.

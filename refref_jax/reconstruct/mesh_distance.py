@@ -32,10 +32,12 @@ from refref_jax.geometry.triangle_meshes import (
     Faces,
     Mesh,
     Vertices,
-    corner_normals,
+    average_normals,
+    corner_angles,
     diameter,
     face_normals,
     is_degenerate,
+    smooth_groups,
     unit_vectors,
 )
 from refref_jax.reconstruct import ReconstructionError
@@ -136,9 +138,11 @@ class ClosestSearch:
 def signed_distance(mesh: Mesh) -> Field:
     """Returns the exact distance to a closed mesh as a field, negative inside."""
     search = ClosestSearch(mesh.vertices, mesh.faces)
-    of_faces = face_normals(mesh.vertices[mesh.faces])
+    corners = mesh.vertices[mesh.faces]
+    of_faces = face_normals(corners)
     of_edges = _edge_normals(mesh.faces, of_faces)
-    of_corners = corner_normals(mesh.vertices, mesh.faces, crease_angle=np.pi)
+    groups = smooth_groups(mesh.vertices, mesh.faces, crease_angle=np.pi)
+    of_corners = average_normals(of_faces, groups, corner_angles(corners))
 
     def field(points: Points) -> Values:
         found = search(points)
