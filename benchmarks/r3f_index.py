@@ -57,7 +57,7 @@ def main(arguments: list[str]) -> None:
 def _mesh_of_masks(scene: Path, out: Path) -> Mesh:
     """Reconstructs an object as the command does, with an index that is never used."""
     folder = out / "reconstruction"
-    config = ReconstructionConfig("hull", _CELLS, 0, 1.5, None, None, 0, 0)
+    config = ReconstructionConfig("hull", _CELLS, 0, 1.5, None, None, "none", 0)
     found = chain.reconstruct(scene, folder, config, compare=True)
     return object_source.read_mesh(folder, found)
 

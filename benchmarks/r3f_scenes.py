@@ -56,7 +56,7 @@ def _config() -> ReconstructionConfig:
         index=_INDEX,
         space=None,
         radius=None,
-        light_steps=0,
+        refinement="none",
         seed=0,
     )
 

@@ -42,13 +42,11 @@ def reconstruct(
         installed, if no object fits the masks, or if the folder contains anything else.
     """
     import_skimage()
-    for split in _splits(config):
-        masks = scene_folder.read_masks(scene_folder.read_frames(scene, split))
-        if config.outliers >= len(masks):
-            raise ValueError(
-                f"--outliers={config.outliers}, but there are {len(masks)} {split} masks. Use "
-                "fewer."
-            )
+    masks = scene_folder.read_masks(scene_folder.read_frames(scene, "train"))
+    if config.outliers >= len(masks):
+        raise ValueError(
+            f"--outliers={config.outliers}, but there are {len(masks)} train masks. Use fewer."
+        )
     # Broken files are reported now, not after hours.
     scene_folder.read_masks(report.judging_frames(scene)[1])
     asked = Reconstruction(scene_names.of_folder(scene), fingerprint(scene), config)
@@ -81,7 +79,7 @@ def read_part(out: Path) -> MeshPart:
       ValueError: if the folder contains no reconstruction, or an unfinished one.
     """
     found = records.read(out)
-    waits_for_light = found.config.light_steps > 0 and found.light is None
+    waits_for_light = found.config.refinement == "light" and found.light is None
     if (
         found.geometry is None
         or found.index is None
@@ -173,15 +171,10 @@ def _index(scene: Path, out: Path, found: Reconstruction) -> IndexFacts:
     return IndexFacts("estimated", estimate.index, estimate.deviation, estimate.error)
 
 
-def _splits(config: ReconstructionConfig) -> tuple[str, ...]:
-    """Returns the splits that a reconstruction reads, apart from its report."""
-    return ("train", "val") if config.light_steps > 0 else ("train",)
-
-
 def _refined(scene: Path, out: Path, found: Reconstruction, say: Say) -> Reconstruction:
     """Refines the object by light, if requested and not done yet."""
     there = found.light is not None and object_source.surface_file(out, found).is_file()
-    if found.config.light_steps > 0 and not there:
+    if found.config.refinement == "light" and not there:
         bare = dataclasses.replace(found, light=None, report=None)
         found = dataclasses.replace(bare, light=_light(scene, out, bare))
         records.write(out, found)
@@ -193,30 +186,32 @@ def _refined(scene: Path, out: Path, found: Reconstruction, say: Say) -> Reconst
 def _light(scene: Path, out: Path, found: Reconstruction) -> LightFacts:
     folder, seed = out / _INDEX_FOLDER, found.config.seed
     folder.mkdir(exist_ok=True)
+    background = index_stage.learn_background(
+        scene,
+        folder,
+        seed=seed,
+        space=found.config.space,
+        radius=found.config.radius,
+        centre=found.config.centre,
+    )
     return light_stage.run(
         scene,
         object_source.read_mesh(out, found),
         found.index,
-        index_stage.learn_background(
-            scene,
-            folder,
-            seed=seed,
-            space=found.config.space,
-            radius=found.config.radius,
-            centre=found.config.centre,
-        ),
+        index_stage.backdrop_of(folder, background),
         out / light_stage.FOLDER / found.geometry.mesh,
-        steps=found.config.light_steps,
         seed=seed,
     )
 
 
 def _describe_light(facts: LightFacts) -> str:
-    lines = (
-        f"refinement by light: error of the validation views {facts.before:.4f} before, "
-        f"{facts.after:.4f} after {facts.steps} steps"
-    )
-    return f"{lines}; kept" if facts.kept else f"{lines}; discarded"
+    if facts.before is None:
+        return f"refinement by light: none, since {facts.remark}"
+    line = f"refinement by light: error of {report.JUDGES[facts.split]} {facts.before:.4f} before"
+    if not facts.kept:
+        return f"{line}; the surface from masks stays, since {facts.remark}"
+    deviation = "" if facts.deviation is None else f" +- {facts.deviation:.4f}"
+    return f"{line}, {facts.after:.4f} after; {facts.shape}, index {facts.index:.4f}{deviation}"
 
 
 def _describe_geometry(found: Reconstruction) -> str:

@@ -25,7 +25,7 @@ class ReconstructionFlags(NamedTuple):
     geometry: flags.FlagHolder[str]
     resolution: flags.FlagHolder[int]
     outliers: flags.FlagHolder[int]
-    light_steps: flags.FlagHolder[int]
+    refinement: flags.FlagHolder[str]
 
     def chosen(
         self,
@@ -37,9 +37,9 @@ class ReconstructionFlags(NamedTuple):
         centre: choices.Position | None = None,
     ) -> records.ReconstructionConfig:
         """Returns the options of the reconstruction; an index of `None` is estimated."""
-        geometry, resolution, outliers, light_steps = (each.value for each in self)
+        geometry, resolution, outliers, refinement = (each.value for each in self)
         return records.ReconstructionConfig(
-            geometry, resolution, outliers, index, space, radius, light_steps, seed, centre
+            geometry, resolution, outliers, index, space, radius, refinement, seed, centre
         )
 
 
@@ -49,13 +49,13 @@ def reconstruction() -> ReconstructionFlags:
     how += "trained on them."
     cells = "Cells along the longest edge of the grid around the object."
     wrong = "Number of masks that may be wrong, which reduces the accuracy of a hull everywhere."
-    steps = "Steps of the refinement of the surface with refracted light; 0 skips it. "
-    steps += "The result is kept only if it explains validation images better."
+    light = "What refines the surface and the index: the light refracted through it, or nothing. "
+    light += "The result is kept only if it explains pixels better that were not fitted."
     found = ReconstructionFlags(
         flags.DEFINE_enum("geometry", "hull", GEOMETRIES, how),
         flags.DEFINE_integer("resolution", 128, cells, 16, 1024),
         flags.DEFINE_integer("outliers", 0, wrong, 0),
-        flags.DEFINE_integer("light_steps", 0, steps, 0),
+        flags.DEFINE_enum("refinement", "light", ["light", "none"], light),
     )
     flags.register_multi_flags_validator(
         ["geometry", "outliers"],

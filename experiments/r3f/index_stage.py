@@ -1,27 +1,26 @@
-"""Estimates the index of refraction: trains a background, then searches for the index.
+"""Estimates the index of refraction: learns the background, then searches for the index.
 
-    {folder}/background/    a run: the field of the background, from pixels outside the masks
+    {folder}/background/    a run: the background, from pixels outside the masks
     {folder}/index.png      the error as a function of the index
 
-The background is trained with straight rays on pixels that do not see the object, so that no wrong
-index can corrupt it. If the object fills all images there are no such pixels, and the index must be
-set by the user. `look` draws pixels that see the object, for this stage and for the refinement by
-light.
+The background is learned with straight rays from pixels that do not see the object, so that no
+wrong index can corrupt it. It is a backdrop where the world is the surface that the scene states
+and the images agree, else a field. If the object fills all images there are no such pixels, and the
+index must be set by the user. `photographs` draws pixels that see the object, for this stage and
+for the refinement by light.
 """
 
 import dataclasses
 from pathlib import Path
-from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Int
 
 from experiments.cli import app
 from experiments.cli.progress import ProgressBar
 from experiments.figures import style
 from experiments.figures.style import COLOURS, pyplot
-from refref_jax.choices import Position, Space
+from refref_jax.choices import Position, Space, Split
 from refref_jax.data import image_files, scene_folder
 from refref_jax.data.scene_assembly import assemble_scene
 from refref_jax.geometry.cameras import pixel_rays
@@ -29,6 +28,7 @@ from refref_jax.geometry.surfaces import pack_meshes
 from refref_jax.geometry.triangle_meshes import Mesh
 from refref_jax.optics.interface_rules import NO_PARENT, nested
 from refref_jax.optics.scene import Scene
+from refref_jax.reconstruct.photometry import Backdrop, Photographs, make_backdrop
 from refref_jax.reconstruct.refractive_index import (
     Evidence,
     IndexEstimate,
@@ -36,11 +36,12 @@ from refref_jax.reconstruct.refractive_index import (
     estimate_index,
     most_looks,
 )
-from refref_jax.render import checkpoint_io
+from refref_jax.reconstruct.shape_from_refraction import find_index, most_looks_at_backdrop
+from refref_jax.render import checkpoint_io, volume_rendering
 from refref_jax.render.checkpoint_io import SavedModel
-from refref_jax.render.model import Model, ModelConfig
+from refref_jax.render.model import Model, ModelConfig, surface_of
 from refref_jax.training import fit, run_folder
-from refref_jax.training.config import TrainConfig
+from refref_jax.training.config import TrainConfig, require
 from refref_jax.training.resolve import read_facts, resolve
 
 PRESET = "tiny"
@@ -50,46 +51,42 @@ STEPS = 1000
 """Training steps of the background; more change the index by less than a thousandth."""
 
 RAYS = 4096
-"""Number of pixels that the index is fitted to."""
+"""Number of pixels that the index is fitted to in front of a field."""
+
+MANY_RAYS = 60_000
+"""The same in front of a backdrop."""
+
+BACKGROUND = "background"
+"""Name of the run of the background."""
 
 # Placeholder for the index before it is known.
 _BEFORE = 1.5
 
 
-class ObjectPixels(NamedTuple):
-    """Pixels of a split that see the object.
-
-    Attributes:
-      evidence: rays, colours and the field of the background.
-      views: image number of each pixel.
-    """
-
-    evidence: Evidence
-    views: Int[np.ndarray, " rays"]
-
-
-def look(scene: Path, split: str, model: Model, *, seed: int, rays: int) -> ObjectPixels:
+def photographs(
+    scene: Path, split: Split, *, seed: int, rays: int | None = None, margin: int = 1
+) -> Photographs:
     """Draws pixels well inside the masks of a split, evenly over its views.
 
     Args:
       scene: folder of the scene.
       split: split whose images and masks are read.
-      model: model of the background.
       seed: seed of the draw.
-      rays: approximate number of pixels; fewer if the masks contain fewer.
+      rays: approximate number of pixels, fewer if the masks contain fewer; all by default.
+      margin: distance from the outlines, in pixels.
 
     Raises:
       ValueError: if there are no masks, or if they have no interior.
     """
     frames = scene_folder.read_frames(scene, split)
-    inside = image_files.well_inside(scene_folder.read_masks(frames))
+    inside = image_files.well_inside(scene_folder.read_masks(frames), margin=margin)
     if not inside.any():
         raise ValueError(
             f"No pixel of the {split} views of {scene} lies inside a mask and off its outline. "
             "Use larger images, or check the masks."
         )
     generator = np.random.default_rng(seed)
-    each = -(-rays // len(inside))
+    each = inside[0].size if rays is None else -(-rays // len(inside))
     chosen = []
     for view, mask in enumerate(inside):
         places = np.flatnonzero(mask)
@@ -97,8 +94,7 @@ def look(scene: Path, split: str, model: Model, *, seed: int, rays: int) -> Obje
         chosen.append(picked + view * mask.size)
     view, row, column = np.unravel_index(np.concatenate(chosen), inside.shape)
     rgb = scene_folder.read_images(frames)[view, row, column].astype(np.float32) / 255.0
-    seen = pixel_rays(frames.cameras, view, row, column)
-    return ObjectPixels(Evidence(model.params, *jax.device_put((seen, rgb))), view)
+    return Photographs(pixel_rays(frames.cameras, view, row, column), rgb, view)
 
 
 def object_scene(mesh: Mesh, index: float) -> Scene:
@@ -117,7 +113,6 @@ def run(
     centre: Position | None = None,
     start: float | None = None,
     steps: int = STEPS,
-    rays: int = RAYS,
 ) -> IndexEstimate:
     """Estimates the index of refraction of an object; reuses the results of an earlier call.
 
@@ -131,8 +126,7 @@ def run(
         ball, world units; the scene's own if `None`.
       centre: centre of the background, world units; the scene's own if `None`.
       start: index from which to descend in addition to those of the search.
-      steps: training steps of the background.
-      rays: number of pixels to fit.
+      steps: training steps of the background, if it is a field.
 
     Raises:
       ValueError: if the scene has no masks, or no pixel outside of them.
@@ -140,21 +134,59 @@ def run(
     """
     background = {"space": space, "radius": radius, "centre": centre}
     model = learn_background(scene, folder, seed=seed, steps=steps, **background)
-    evidence, views = look(scene, "train", model, seed=seed, rays=rays)
+    surface = backdrop_of(folder, model)
+    if surface is None:
+        found = _find_before_field(
+            mesh, model, photographs(scene, "train", seed=seed, rays=RAYS), start
+        )
+    else:
+        pixels = photographs(scene, "train", seed=seed, rays=MANY_RAYS)
+        search = IndexSearch(descents=2)
+        with ProgressBar("index", most_looks_at_backdrop(search, start=start)) as bar:
+            found = find_index(
+                mesh,
+                surface,
+                pixels,
+                search=search,
+                start=start,
+                seed=seed,
+                progress=lambda done, _: bar.show(done, "looks"),
+            )
+    draw(folder / "index.png", found)
+    return found
+
+
+def _find_before_field(
+    mesh: Mesh, model: Model, pixels: Photographs, start: float | None
+) -> IndexEstimate:
+    """Searches for the index in front of a field."""
     search = IndexSearch()
+    evidence = Evidence(model.params, *jax.device_put((pixels.rays, pixels.rgb)))
     with ProgressBar("index", most_looks(search, start=start)) as bar:
-        found = estimate_index(
+        return estimate_index(
             evidence,
             object_scene(mesh, _BEFORE),
-            views,
+            pixels.views,
             part=0,
             config=model.config,
             search=search,
             start=start,
             progress=lambda done, _: bar.show(done, "evaluations, at most"),
         )
-    draw(folder / "index.png", found)
-    return found
+
+
+def backdrop_of(folder: Path, model: Model) -> Backdrop | None:
+    """Returns the backdrop of a background; `None` if it is a field.
+
+    Args:
+      folder: folder of the stage.
+      model: model of the background.
+    """
+    if model.config.backdrop is None:
+        return None
+    coverage = run_folder.read_coverage(folder / BACKGROUND)
+    bounds = volume_rendering.domain(model.config)
+    return make_backdrop(bounds, surface_of(model.params), coverage)
 
 
 def learn_background(
@@ -167,7 +199,10 @@ def learn_background(
     centre: Position | None = None,
     steps: int = STEPS,
 ) -> Model:
-    """Returns the field of the background, which is trained first or resumed if necessary.
+    """Returns the background, which is learned first or resumed if necessary.
+
+    A backdrop where the scene says what surface is behind the object and the images agree, else a
+    field; a background that was begun as a field stays one.
 
     Args:
       scene: folder of the scene.
@@ -176,14 +211,14 @@ def learn_background(
       space: type of the background, see `run`.
       radius: size of the background, see `run`.
       centre: centre of the background, see `run`.
-      steps: number of training steps.
+      steps: number of training steps of a field.
 
     Raises:
       ValueError: if the scene has no masks, or no pixel outside of them, or if the training was
         started with another background.
       KeyboardInterrupt: if its training was stopped; it has been saved.
     """
-    run = folder / "background"
+    run = folder / BACKGROUND
     config = TrainConfig().override(
         scene=str(scene.resolve()),
         pixels="background",
@@ -191,17 +226,21 @@ def learn_background(
         radius=radius,
         centre=centre,
         paths="straight",
-        preset=PRESET,
-        footprint="cone",
-        steps=steps,
         seed=seed,
     )
-    wanted = resolve(config, read_facts(config.scene, parts=()))
+    facts = read_facts(config.scene, parts=())
+    wanted = resolve(config, facts)
+    begun = checkpoint_io.read_static(run).config if run_folder.exists(run) else wanted.model.config
+    if wanted.model.config.backdrop is None or begun.backdrop is None:
+        field = {"far_field": "field", "preset": PRESET, "footprint": "cone", "steps": steps}
+        wanted = resolve(config.override(**field), facts)
     if not run_folder.exists(run):
         empty = assemble_scene([], [], rule="nested")
         run_folder.create(run, wanted.config, wanted.model, empty)
     _refuse_another(run, checkpoint_io.read_static(run), wanted.model)
-    with app.Interrupt() as interrupt, ProgressBar("train", steps) as bar:
+    solves = wanted.model.config.backdrop is not None
+    total = require(wanted.config.model.iterations) if solves else steps
+    with app.Interrupt() as interrupt, ProgressBar("solve" if solves else "train", total) as bar:
         ended = fit.train(
             run,
             scene=scene,

@@ -1,41 +1,74 @@
-"""Refines the object with the light refracted through it, an optional stage of R3F.
+"""Refines the object with the light refracted through it, the third stage of R3F.
 
-    {out}/light/{object}_{material}.ply    the refined surface
+    {out}/light/{object}_{material}.ply    the refined surface, if it was kept
+    {out}/light/errors.png                 pixels before and after, and the uncertainty of normals
 
-The result is kept only if it explains the pixels of the validation views better, which it was not
-fitted to, and if the shape has not changed fundamentally. Scenes without validation masks are
-rejected.
+Families of shapes and a free surface are fitted to pixels of the training views, together with the
+index (`reconstruct.shape_from_refraction`). Pixels that were not fitted judge them: those of the
+validation views, or of every eighth training view where these have no masks. Where the background
+is a field, and where light explains nothing better, the surface stays as it is.
 """
 
-import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from scipy.spatial import KDTree
 
 from experiments.cli.progress import ProgressBar
+from experiments.figures.style import pyplot
 from experiments.r3f import index_stage
-from experiments.r3f.index_stage import ObjectPixels
-from experiments.r3f.records import IndexFacts, LightFacts
+from experiments.r3f.records import IndexFacts, LightFacts, TrialFacts
 from refref_jax import atomic_files
-from refref_jax.data import meshes
+from refref_jax.choices import Split
+from refref_jax.data import meshes, scene_folder
+from refref_jax.data.scene_folder import Frames
+from refref_jax.geometry.cameras import image_rays
+from refref_jax.geometry.surfaces import pack_meshes
 from refref_jax.geometry.triangle_meshes import Mesh
-from refref_jax.reconstruct import refractive_index
-from refref_jax.reconstruct.light_refinement import LightRefinement, refine_by_light
+from refref_jax.reconstruct import gauss_newton, photometry, shape_from_refraction
+from refref_jax.reconstruct.masks import Views
+from refref_jax.reconstruct.outlines import Outlines
+from refref_jax.reconstruct.photometry import Backdrop, Photographs
 from refref_jax.reconstruct.refinement import objection
-from refref_jax.render.model import Model
+from refref_jax.reconstruct.shape_from_refraction import Trial
+from refref_jax.render.images import find_first_surface
 
 FOLDER = "light"
 
-# Number of pixels used in the descent, and of pixels for validation.
-_SEEN = 60_000
-_JUDGES = 8192
+FIGURE = "errors.png"
+
+# Number of pixels that judge, and one training view in this many, if there are no others.
+_JUDGES, _ONE_IN = 16_384, 8
 
 # Share of the volume that the refinement may change: it corrects normals, not outlines.
 _VOLUME_CHANGE = 0.02
 
+# Rows of the figure, and largest error and deviation that it distinguishes, in sRGB and degrees.
+_ROWS, _MOST_ERROR, _MOST_DEVIATION = 3, 0.2, 0.5
+
+# Deviation of normals beyond which light has not determined them, degrees.
+_UNKNOWN = 0.5
+
+
+class Seen(NamedTuple):
+    """Pixels that see the object.
+
+    Attributes:
+      fitted: pixels to fit.
+      judges: other pixels.
+      split: split of the judges.
+    """
+
+    fitted: Photographs
+    judges: Photographs
+    split: Split
+
 
 def run(
-    scene: Path, mesh: Mesh, known: IndexFacts, model: Model, target: Path, *, steps: int, seed: int
+    scene: Path, mesh: Mesh, known: IndexFacts, surface: Backdrop | None, target: Path, *, seed: int
 ) -> LightFacts:
     """Refines an object, and writes it if it is better.
 
@@ -43,54 +76,189 @@ def run(
       scene: folder of the scene; training and validation images and masks are read.
       mesh: mesh of the object.
       known: index of refraction, which is fixed if the user set it.
-      model: model of the background.
+      surface: backdrop; `None` if the background is a field.
       target: path of the mesh to write, in a folder of its own.
-      steps: number of steps of the descent.
       seed: random seed.
-
-    Raises:
-      ValueError: if there is no validation split with masks.
     """
-    index, settings = known.index, LightRefinement(steps=steps, seed=seed)
-    if known.source == "given":
-        settings = dataclasses.replace(settings, index_stride=0.0)
-    judges = find_judges(scene, model, seed=seed)
-    seen = index_stage.look(scene, "train", model, seed=seed, rays=_SEEN)
-    with ProgressBar("light", steps) as bar:
-        found = refine_by_light(
-            mesh,
-            index,
-            index_stage.object_scene(mesh, index).interfaces,
-            seen.evidence,
-            config=model.config,
-            settings=settings,
-            progress=lambda step, error: bar.show(step, f"error {error:.4f}"),
-        )
-    before = judge(mesh, index, judges, model)
-    after = judge(found.mesh, found.index, judges, model)
-    kept = after < before and not objection(mesh, found.mesh, _VOLUME_CHANGE)
-    if kept:
-        with atomic_files.written_folder(target.parent) as folder:
-            meshes.write_mesh(folder / target.name, *found.mesh)
-    return LightFacts(steps, kept, before, after, found.index, found.furthest)
-
-
-def find_judges(scene: Path, model: Model, *, seed: int) -> ObjectPixels:
-    """Returns the pixels of the validation views by which a refinement is judged.
-
-    Raises:
-      ValueError: if there is no validation split with masks.
-    """
-    return index_stage.look(scene, "val", model, seed=seed + 1, rays=_JUDGES)
-
-
-def judge(mesh: Mesh, index: float, judges: ObjectPixels, model: Model) -> float:
-    """Returns the mean error of the validation pixels in sRGB, with the mesh's own BVH."""
-    errors = refractive_index.errors_at_index(
-        np.float32(index),
-        judges.evidence,
-        index_stage.object_scene(mesh, index),
-        part=0,
-        config=model.config,
+    if surface is None:
+        reason = "the background is a field, not a surface at a known place"
+        return LightFacts(kept=False, index=known.index, remark=reason)
+    seen = read(scene, seed=seed)
+    trials = fit(scene, mesh, known, surface, seen, seed=seed)
+    masks, chosen = trials[0], shape_from_refraction.choose(trials)
+    remark = "" if chosen is not masks else "no shape explains the judges significantly better"
+    if not remark and (complaint := objection(mesh, chosen.mesh, _VOLUME_CHANGE)):
+        chosen, remark = masks, f"the {chosen.name} was rejected: {complaint}"
+    kept = chosen is not masks
+    deviations = shape_from_refraction.normal_deviations(chosen)
+    with atomic_files.written_folder(target.parent) as folder:
+        if kept:
+            meshes.write_mesh(folder / target.name, *chosen.mesh)
+        draw(folder / FIGURE, scene, seen.split, masks, chosen, surface, deviations)
+    unknown = float(np.mean(deviations > _UNKNOWN)) if kept else 1.0
+    return LightFacts(
+        kept=kept,
+        index=chosen.index if known.source == "estimated" else known.index,
+        shape=chosen.name,
+        before=masks.error,
+        after=chosen.error,
+        deviation=index_deviation(chosen) if kept else None,
+        undetermined=unknown,
+        split=seen.split,
+        remark=remark,
+        trials=tuple(_facts(trial, min(trials, key=lambda each: each.error)) for trial in trials),
     )
-    return float(np.asarray(errors, np.float64).mean())
+
+
+def read(scene: Path, *, seed: int) -> Seen:
+    """Returns the pixels to fit, and those that judge.
+
+    Raises:
+      ValueError: if no pixel is well inside a mask.
+    """
+    fitted = index_stage.photographs(scene, "train", seed=seed)
+    path = scene / "transforms_val.json"
+    if path.is_file() and scene_folder.read_frames(scene, "val").masks is not None:
+        judges = index_stage.photographs(scene, "val", seed=seed + 1, rays=_JUDGES)
+        return Seen(fitted, judges, "val")
+    held = fitted.views % _ONE_IN == 0
+    some = np.flatnonzero(held)
+    some = np.random.default_rng(seed).permutation(some)[:_JUDGES]
+    return Seen(fitted.chosen(np.flatnonzero(~held)), fitted.chosen(some), "train")
+
+
+def fit(
+    scene: Path, mesh: Mesh, known: IndexFacts, surface: Backdrop, seen: Seen, *, seed: int
+) -> tuple[Trial, ...]:
+    """Fits all shapes that come near the mesh; see `shape_from_refraction.fit_shapes`."""
+    frames = scene_folder.read_frames(scene, "train")
+    outlines = Outlines(Views(scene_folder.read_masks(frames), frames.cameras), seed=seed)
+    options = {} if known.source == "estimated" else {"deviation": 0.0}
+    with ProgressBar("light", 100) as bar:
+        return shape_from_refraction.fit_shapes(
+            mesh,
+            known.index,
+            surface,
+            seen.fitted,
+            seen.judges,
+            outlines=outlines,
+            seed=seed,
+            progress=lambda share, text: bar.show(round(100 * share), text),
+            **options,
+        )
+
+
+def index_deviation(trial: Trial) -> float:
+    """Returns the standard deviation of the index of refraction."""
+    return float(np.sqrt(max(trial.index_variance, 0.0)))
+
+
+def _facts(trial: Trial, best: Trial) -> TrialFacts:
+    worse = shape_from_refraction.compare(trial, best)
+    return TrialFacts(
+        trial.name,
+        len(trial.fit.x),
+        trial.error,
+        worse.mean,
+        worse.error,
+        trial.index,
+        index_deviation(trial),
+        trial.fit.taken,
+    )
+
+
+def draw(
+    path: Path,
+    scene: Path,
+    split: Split,
+    before: Trial,
+    after: Trial,
+    surface: Backdrop,
+    deviations: Float[np.ndarray, " normals"],
+) -> None:
+    """Draws views: the photograph, what both surfaces predict, their errors, and the uncertainty.
+
+    Args:
+      path: file to write.
+      scene: folder of the scene.
+      split: split of the views.
+      before: the surface from masks.
+      after: the chosen one.
+      surface: backdrop.
+      deviations: standard deviation of each normal of the chosen surface, degrees.
+    """
+    frames = scene_folder.read_frames(scene, split)
+    count = len(frames.names)
+    chosen = np.unique(np.linspace(0, count - 1, min(_ROWS, count)).astype(int))
+    masks, images = scene_folder.read_masks(frames), scene_folder.read_images(frames)
+    titles = ("photograph", "from masks", "by light", "error before", "error after", "normals ±")
+    figure, axes = pyplot.subplots(
+        len(chosen),
+        len(titles),
+        figsize=(12.5, 2.1 * len(chosen) + 0.3),
+        squeeze=False,
+        layout="constrained",
+    )
+    for axis in axes.flat:
+        axis.axis("off")
+    for axis, title in zip(axes[0], titles, strict=True):
+        axis.set_title(title, fontsize=9)
+    shown = None
+    for row, view in zip(axes, chosen, strict=True):
+        panels = _panels(frames, int(view), images[view], masks[view], (before, after), surface)
+        for axis, panel in zip(row[:3], panels[:3], strict=True):
+            axis.imshow(panel)
+        for axis, panel in zip(row[3:5], panels[3:], strict=True):
+            errors = axis.imshow(panel, vmin=0.0, vmax=_MOST_ERROR, cmap="magma")
+        seen = _seen_deviations(frames, int(view), after, deviations)
+        shown = row[5].imshow(seen, vmin=0.0, vmax=_MOST_DEVIATION, cmap="viridis")
+    figure.colorbar(errors, ax=axes[:, 3:5], label="sRGB", shrink=0.8, aspect=40, pad=0.01)
+    figure.colorbar(shown, ax=axes[:, 5], label="degrees", shrink=0.8, aspect=40, pad=0.01)
+    figure.savefig(path, dpi=110)
+    pyplot.close(figure)
+
+
+def _panels(
+    frames: Frames,
+    view: int,
+    image: UInt8[np.ndarray, "h w 3"],
+    mask: Bool[np.ndarray, "h w"],
+    trials: Sequence[Trial],
+    surface: Backdrop,
+) -> list[np.ndarray]:
+    """Returns the photograph, the predictions, and their errors within the mask."""
+    rays = image_rays(frames.cameras, view)
+    flat = rays._replace(**{k: getattr(rays, k).reshape(-1, *s) for k, s in _SHAPES.items()})
+    photograph = image.astype(np.float64) / 255.0
+    predicted = []
+    for trial in trials:
+        body = gauss_newton.body_of(trial.model.pose(trial.fit.x))
+        linear = photometry.predict(body, surface, flat).linear
+        predicted.append(photometry.encode(linear).reshape(photograph.shape))
+    errors = [
+        np.where(mask, np.sqrt(np.mean((each - photograph) ** 2, axis=-1)), np.nan)
+        for each in predicted
+    ]
+    return [photograph, *predicted, *errors]
+
+
+_SHAPES = {"origins": (3,), "directions": (3,), "radii": ()}
+
+
+def _seen_deviations(
+    frames: Frames, view: int, trial: Trial, deviations: Float[np.ndarray, " normals"]
+) -> Float[np.ndarray, "h w"]:
+    """Returns the deviation of the normal that each pixel sees, NaN beside the object."""
+    rays = image_rays(frames.cameras, view)
+    first = find_first_surface(pack_meshes([trial.mesh]), rays)
+    seen = np.full(first.distances.shape, np.nan)
+    hit = np.isfinite(first.distances)
+    if not len(deviations) or not hit.any():
+        return seen
+    part = trial.model.pose(trial.fit.x).parts[0]
+    of_vertices = np.zeros(len(part.vertices))
+    of_vertices[part.faces.ravel()] = deviations[part.normal_ids.ravel()]
+    reach = np.where(hit, first.distances, 0.0)[..., None]
+    points = (rays.origins + reach * rays.directions)[hit]
+    seen[hit] = of_vertices[KDTree(part.vertices).query(points)[1]]
+    return seen

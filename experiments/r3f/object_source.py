@@ -55,7 +55,9 @@ def surface_file(out: Path, found: Reconstruction) -> Path:
 def index_facts(found: Reconstruction) -> IndexFacts:
     """Returns the index of refraction that belongs to the surface."""
     moved = found.light is not None and found.light.kept and found.index.source == "estimated"
-    return IndexFacts("refined", found.light.index, None, None) if moved else found.index
+    if not moved:
+        return found.index
+    return IndexFacts("refined", found.light.index, found.light.deviation, None)
 
 
 def read_part(out: Path, found: Reconstruction) -> MeshPart:

@@ -20,6 +20,12 @@ from refref_jax.choices import Position, Space
 
 FILE = "reconstruction.json"
 
+Refinement = Literal["light", "none"]
+"""What refines the surface from masks."""
+
+# Earlier versions had a number of steps here.
+_FORMER_STEPS = dict.fromkeys(range(1, 10_001), "light") | {0: "none"}
+
 
 @dataclasses.dataclass(frozen=True)
 class ReconstructionConfig:
@@ -33,7 +39,7 @@ class ReconstructionConfig:
       space: type of the background, or `None` for the scene's own.
       radius: half-extent of the background cube, or radius of the sphere or of the uncontracted
         ball, world units; `None` for the scene's own.
-      light_steps: number of steps of the refinement by light; 0 skips it.
+      refinement: whether light refines the surface: `light`, or `none`.
       seed: random seed.
       centre: centre of the background, world units; `None` for the scene's own.
     """
@@ -44,7 +50,9 @@ class ReconstructionConfig:
     index: float | None
     space: Space | None
     radius: float | None
-    light_steps: int
+    refinement: Refinement = dataclasses.field(
+        metadata={configuration.FORMERLY: "light_steps", configuration.FORMER_VALUES: _FORMER_STEPS}
+    )
     seed: int
     centre: Position | None = None
 
@@ -98,24 +106,58 @@ class IndexFacts:
 
 
 @dataclasses.dataclass(frozen=True)
+class TrialFacts:
+    """One shape that was fitted by light.
+
+    Attributes:
+      shape: kind of the shape.
+      unknowns: number of its unknowns, the index included.
+      error: mean error of the judges, sRGB.
+      worse: error beyond that of the best shape.
+      worse_error: standard error of that difference, over views.
+      index: index of refraction.
+      deviation: standard deviation of the index.
+      steps: number of steps that were taken.
+    """
+
+    shape: str
+    unknowns: int
+    error: float
+    worse: float
+    worse_error: float
+    index: float
+    deviation: float
+    steps: int
+
+
+@dataclasses.dataclass(frozen=True)
 class LightFacts:
     """Results of the refinement by light.
 
     Attributes:
-      steps: number of steps of the descent.
-      kept: whether the validation views are explained better.
-      before: mean error of their pixels before, sRGB.
-      after: mean error of their pixels after, sRGB.
-      index: index of refraction after the refinement.
-      furthest: largest displacement of the surface, world units.
+      kept: whether the refined surface is used.
+      index: index of refraction of the surface that is used.
+      shape: kind of the chosen shape.
+      before: mean error of the judges with the surface from masks, sRGB; `None` if none was looked
+        at.
+      after: the same with the chosen one.
+      deviation: standard deviation of the index; `None` if it was not refined.
+      undetermined: share of the normals that light has not determined.
+      split: split of the views that judge.
+      remark: reason why the surface was not refined.
+      trials: all shapes that were fitted.
     """
 
-    steps: int
     kept: bool
-    before: float
-    after: float
     index: float
-    furthest: float
+    shape: str = "masks"
+    before: float | None = None
+    after: float | None = None
+    deviation: float | None = None
+    undetermined: float = 1.0
+    split: str = "val"
+    remark: str = ""
+    trials: tuple[TrialFacts, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -248,4 +290,4 @@ def _told(name: str, value: object) -> object:
 
 _OPTIONS = {"index": "ior", "space": "background"}
 # First stage that an option affects, if it is not the geometry.
-_STAGES = dict.fromkeys(("index", "space", "radius", "centre"), "index") | {"light_steps": "light"}
+_STAGES = dict.fromkeys(("index", "space", "radius", "centre"), "index") | {"refinement": "light"}

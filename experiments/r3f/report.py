@@ -46,6 +46,10 @@ _SEEN_ON = {
 }
 
 
+JUDGES = {"val": "validation views", "train": "training views that were not fitted"}
+"""Views that judge the refinement by light, by their split."""
+
+
 class _Truth(NamedTuple):
     """The scene's own outermost surface, or the reason why it is missing."""
 
@@ -210,6 +214,7 @@ def markdown(out: Path, found: Reconstruction, facts: ReportFacts) -> str:
         f"## Surface\n\n{_of_truth(facts)}",
         "![Normals, and the distance to the true surface](pictures/surface.png)",
         *_pictures_of_index(out),
+        *_of_light(found),
         "## Options\n\n" + _making(found),
         "## Next steps\n\n```bash\n"
         + app.shell("train", "--scene=SCENE", "--reconstruction=OUT", "--out=RUN")
@@ -237,15 +242,10 @@ def _table(out: Path, found: Reconstruction, facts: ReportFacts) -> str:
             f"**{facts.mean_overlap:.4f}**, {min(facts.overlaps):.4f}",
         ),
     ]
-    if found.light is not None:
+    if found.light is not None and found.light.before is not None:
         light = found.light
-        kept = f"kept, with index {light.index:.4f}" if light.kept else "discarded"
-        rows.append(
-            (
-                "error of validation views, by light",
-                f"{light.before:.4f} before, {light.after:.4f} after; {kept}",
-            )
-        )
+        after = f"{light.after:.4f} as a {light.shape}" if light.kept else "not refined"
+        rows.append((f"error of {JUDGES[light.split]}, sRGB", f"{light.before:.4f}; {after}"))
     if facts.truth is not None:
         truth = facts.truth
         rows += [
@@ -275,6 +275,39 @@ def _of_truth(facts: ReportFacts) -> str:
     )
 
 
+def _of_light(found: Reconstruction) -> list[str]:
+    """Returns the section on the refinement by light."""
+    light = found.light
+    if light is None:
+        return []
+    if light.before is None:
+        return [f"## Refinement by light\n\nThere was none, since {light.remark}."]
+    lines = [
+        "| shape | unknowns | error, sRGB | worse than the best | index | steps |",
+        "|---|---|---|---|---|---|",
+    ]
+    for trial in light.trials:
+        name = f"**{trial.shape}**" if trial.shape == light.shape else trial.shape
+        lines.append(
+            f"| {name} | {trial.unknowns} | {trial.error:.4f} | {trial.worse:.4f} ± "
+            f"{trial.worse_error:.4f} | {trial.index:.4f} ± {trial.deviation:.4f} | {trial.steps} |"
+        )
+    chosen = (
+        f"The smallest shape that is not worse than the best by two standard errors is the "
+        f"**{light.shape}**. Light has not determined {light.undetermined:.0%} of its normals to "
+        "half a degree; these keep the prior."
+    )
+    if not light.kept:
+        chosen = f"The surface from masks stays as it is, since {light.remark}."
+    return [
+        f"## Refinement by light\n\nShapes fitted to pixels of the training views, judged by "
+        f"{JUDGES[light.split]}; deviations are one standard error.",
+        "\n".join(lines),
+        chosen,
+        "![Pixels before and after, and the uncertainty of the normals](light/errors.png)",
+    ]
+
+
 def _pictures_of_index(out: Path) -> list[str]:
     found = sorted((out / "index").glob("*.png"))
     return ["## Index of refraction"] * bool(found) + [
@@ -286,7 +319,7 @@ def _making(found: Reconstruction) -> str:
     config, geometry = found.config, found.geometry
     lines = [
         f"- `--geometry={config.geometry} --resolution={config.resolution} "
-        f"--outliers={config.outliers} --light_steps={config.light_steps} --seed={config.seed}`"
+        f"--outliers={config.outliers} --refinement={config.refinement} --seed={config.seed}`"
         + (f" `--ior={config.index:g}`" if config.index is not None else "")
         + (f" `--background={config.space}`" if config.space is not None else "")
         + (f" `--radius={config.radius:g}`" if config.radius is not None else "")

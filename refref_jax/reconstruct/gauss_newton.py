@@ -25,7 +25,7 @@ refracted light; the sparse Jacobian through traced triangles is ours.
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import scipy.linalg
@@ -75,6 +75,7 @@ class Candidate(NamedTuple):
     by_tints: Matrix
 
 
+@runtime_checkable
 class Model(Protocol):
     """What a vector of unknowns means."""
 
@@ -167,7 +168,7 @@ class Fit(NamedTuple):
         return sum(step.taken for step in self.steps)
 
 
-class _Equations(NamedTuple):
+class Equations(NamedTuple):
     """Normal equations of a linearisation, without the prior.
 
     Attributes:
@@ -192,11 +193,9 @@ def body_of(candidate: Candidate) -> Body:
     )
 
 
-def errors_of(
-    candidate: Candidate, surface: Backdrop, pixels: Photographs
-) -> Float[np.ndarray, " rays"]:
+def errors_of(body: Body, surface: Backdrop, pixels: Photographs) -> Float[np.ndarray, " rays"]:
     """Returns the robust error of each pixel in sRGB: root mean square of channels, capped."""
-    predicted = photometry.predict(body_of(candidate), surface, pixels.rays)
+    predicted = photometry.predict(body, surface, pixels.rays)
     errors = np.sqrt(np.mean(photometry.residuals(predicted.linear, pixels.rgb) ** 2, axis=1))
     return np.where(predicted.dropped < 1.0 - _FOLLOWED, np.minimum(errors, _CAP), _CAP)
 
@@ -233,12 +232,11 @@ def fit(
     for number, blur in enumerate(settings.blurs):
         seen = photometry.blurred(surface, blur)
         candidate = model.pose(x)
-        light = _linearise(candidate, seen, draw(settings.rays), settings)
+        body = body_of(candidate)
+        light = linearise(candidate, body, seen, draw(settings.rays), settings)
         if outlines is not None:
             light = _with_rows(light, outlines(candidate))
-        x, damping, fact = _step(
-            model, x, candidate, light, seen, draw(settings.judges), damping, blur
-        )
+        x, damping, fact = _step(model, x, body, light, seen, draw(settings.judges), damping, blur)
         facts.append(fact)
         if progress is not None:
             progress(number + 1, fact)
@@ -257,8 +255,8 @@ def _draw(pixels: Photographs, generator: np.random.Generator, count: int) -> Ph
 def _step(
     model: Model,
     x: Float[np.ndarray, " unknowns"],
-    candidate: Candidate,
-    light: _Equations,
+    body: Body,
+    light: Equations,
     surface: Backdrop,
     judges: Photographs,
     damping: float,
@@ -268,12 +266,12 @@ def _step(
     precision, pull = model.prior(x)
     matrix, gradient = light.matrix + precision, light.gradient + pull
     scales = model.scales()
-    before = float(errors_of(candidate, surface, judges).mean())
+    before = float(errors_of(body, surface, judges).mean())
     for _ in range(3):
         damped = matrix + damping * np.diag(np.diag(light.matrix) + np.diag(precision))
         change = -scipy.linalg.solve(damped, gradient, assume_a="pos")
         change *= min(1.0, 1.0 / max(float(np.max(np.abs(change) / scales)), 1e-12))
-        after = float(errors_of(model.pose(x + change), surface, judges).mean())
+        after = float(errors_of(body_of(model.pose(x + change)), surface, judges).mean())
         rms = float(np.sqrt(np.mean((change / scales) ** 2)))
         if after < before:
             return (
@@ -285,7 +283,7 @@ def _step(
     return x, damping, StepFacts(blur, before, after, damping, False, rms)
 
 
-def _with_rows(light: _Equations, rows: Rows) -> _Equations:
+def _with_rows(light: Equations, rows: Rows) -> Equations:
     """Returns the equations with further ones."""
     weighted = scipy.sparse.diags_array(rows.weights) @ rows.derivatives
     matrix = rows.derivatives.T @ weighted
@@ -294,11 +292,18 @@ def _with_rows(light: _Equations, rows: Rows) -> _Equations:
     return light._replace(matrix=light.matrix + dense, gradient=light.gradient + gradient)
 
 
-def _linearise(
-    candidate: Candidate, surface: Backdrop, pixels: Photographs, settings: Steps
-) -> _Equations:
-    """Returns the normal equations of some pixels."""
-    body = body_of(candidate)
+def linearise(
+    candidate: Candidate, body: Body, surface: Backdrop, pixels: Photographs, settings: Steps
+) -> Equations:
+    """Returns the normal equations of some pixels.
+
+    Args:
+      candidate: scene with derivatives.
+      body: the same scene on the device.
+      surface: backdrop.
+      pixels: some pixels.
+      settings: settings of the fit, of which the share of outliers counts.
+    """
     predicted = photometry.predict(body, surface, pixels.rays)
     found = photometry.sensitivities(body, surface, pixels.rays, predicted)
     error = photometry.residuals(predicted.linear, pixels.rgb)
@@ -320,16 +325,19 @@ def _linearise(
     scale = max(squared, _LEAST_NOISE**2)
     by_ray = np.arange(3 * len(error)) // 3
     each = scipy.sparse.csr_array(
-        (error.reshape(-1) / scale, (pixels.views[by_ray], 3 * by_ray + np.arange(by_ray.size) % 3)),
+        (
+            error.reshape(-1) / scale,
+            (pixels.views[by_ray], 3 * by_ray + np.arange(by_ray.size) % 3),
+        ),
         shape=(int(pixels.views.max()) + 1, by_ray.size),
     )
     by_view = each @ weighted
     by_view = by_view.toarray() if scipy.sparse.issparse(by_view) else by_view
-    return _Equations(dense / scale, by_view.sum(axis=0), by_view)
+    return Equations(dense / scale, by_view.sum(axis=0), by_view)
 
 
 def _covariance(
-    light: _Equations, precision: Float[np.ndarray, "unknowns unknowns"]
+    light: Equations, precision: Float[np.ndarray, "unknowns unknowns"]
 ) -> Float[np.ndarray, "unknowns unknowns"]:
     """Returns the covariance of the unknowns, with errors of a view that are alike."""
     inverse = np.linalg.inv(light.matrix + precision)
@@ -340,9 +348,7 @@ def _covariance(
     return inverse * max(1.0, alike)
 
 
-def _by_unknowns(
-    candidate: Candidate, body: Body, found: photometry.Sensitivities
-) -> Matrix:
+def _by_unknowns(candidate: Candidate, body: Body, found: photometry.Sensitivities) -> Matrix:
     """Returns the derivatives of the coordinates of all rays by the unknowns, ray-major."""
     parts = candidate.parts
     first = np.cumsum([0] + [len(part.vertices) for part in parts])
@@ -355,7 +361,9 @@ def _by_unknowns(
     total = _scattered(found.by_corners[ray, :, bend], ray, vertices[face], (count, first[-1]))
     by = _stacked([part.by_vertices for part in parts])
     total = total @ by
-    turned = _scattered(found.by_normals[ray, :, bend], ray, normals[face], (count, first_normal[-1]))
+    turned = _scattered(
+        found.by_normals[ray, :, bend], ray, normals[face], (count, first_normal[-1])
+    )
     total = total + turned @ _stacked([part.by_normals for part in parts])
     by_index = scipy.sparse.csr_array(found.by_indices.reshape(3 * count, -1).astype(np.float64))
     return total + by_index @ candidate.by_indices

@@ -358,3 +358,21 @@ def _slopes(mips: Mips, lookups: Lookups) -> Float[Array, "rays 2 3"]:
         return (there - here) * (0.5 * sides / (2.0 * _HALF_WIDTH))[:, None]
 
     return jnp.stack([along(0), along(1)], axis=1)
+
+
+def make_backdrop(
+    domain: Domain,
+    pyramid: backdrop.Pyramid,
+    coverage: Float[np.ndarray, "6 side side"],
+) -> Backdrop:
+    """Returns a solved backdrop, to be looked up.
+
+    Args:
+      domain: its kind, size and place.
+      pyramid: its radiance, which must not depend on the direction.
+      coverage: number of pixels that see each vertex.
+    """
+    seen = [jnp.zeros_like(level) for level in pyramid]
+    seen[-1] = jnp.repeat(jnp.asarray(coverage, jnp.float32)[..., None], 3, axis=-1)
+    mips, covered = (_mipmap(each, space=domain.space) for each in (pyramid, tuple(seen)))
+    return Backdrop(domain, mips, covered)

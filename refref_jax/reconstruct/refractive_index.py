@@ -255,19 +255,19 @@ def estimate_index(
         found = slope_at_index(at, evidence, scene, part=part, config=config)
         return float(found.error), float(found.slope)
 
-    heights = tuple(float(errors(rung).mean()) for rung in rungs)
+    heights = tuple(float(errors(rung).mean()) for rung in ladder)
     if not np.any(np.isfinite(heights)):
         raise ReconstructionError(
             "No error of a pixel is finite. Check the field that the pixels are compared with."
         )
-    starts = [rungs[i] for i in lowest_rungs(heights, search.descents)]
+    starts = [ladder[i] for i in lowest_rungs(heights, search.descents)]
     starts += [] if start is None else [start]
     ways = [descend(slope, at, search) for at in starts]
     ways.sort(key=lambda way: way.errors[-1] if math.isfinite(way.errors[-1]) else math.inf)
     best = ways[0].indices[-1]
     triple = np.stack([errors(best + shift) for shift in _PARABOLA])
     deviation = scatter_of_bottoms(triple, views, _APART)
-    return IndexEstimate(best, deviation, ways[0].errors[-1], Descent(rungs, heights), tuple(ways))
+    return IndexEstimate(best, deviation, ways[0].errors[-1], Descent(ladder, heights), tuple(ways))
 
 
 def most_looks(search: IndexSearch, *, start: float | None = None) -> int:

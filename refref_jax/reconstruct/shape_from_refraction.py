@@ -18,10 +18,11 @@ from trimesh import Trimesh
 from trimesh.remesh import subdivide_to_size
 
 from refref_jax.geometry.triangle_meshes import Mesh, diameter, make_mesh
+from refref_jax.optics.media import INDEX_OF_AIR
 from refref_jax.optics.interface_rules import NO_PARENT, nested
 from refref_jax.reconstruct import ReconstructionError, families, gauss_newton, photometry
 from refref_jax.reconstruct.gauss_newton import Candidate, Fit, Matrix, Rows, StepFacts, Steps
-from refref_jax.reconstruct.photometry import Backdrop, Photographs
+from refref_jax.reconstruct.photometry import Backdrop, Body, Photographs
 from refref_jax.reconstruct.refractive_index import (
     Descent,
     IndexEstimate,
@@ -46,7 +47,7 @@ _TINT_DEVIATION, _TINT_STEP = 1.0, 0.3
 _LOOK, _LOOK_BLUR, _INDEX_BLURS = 8192, 2, (2, 1, 0, 0)
 
 # Half-width of the parabola for the standard error of an index.
-_APART = 0.002
+_APART = 0.01
 
 # Lengths over which a free surface is smoothed before each group of steps: noise that the handles
 # cannot remove; world units of a body of diameter 2.6. Steps of each group, without blur.
@@ -58,8 +59,9 @@ _FAMILY_STEPS, _FAMILY_RAYS = 4, 20_000
 # A blur is enough if errors are at most this many times what the blur alone adds.
 _ENOUGH = 2.5
 
-# Longest edge of a mesh whose vertices are to be moved, as a share of its diameter.
-_LONGEST = 0.015
+# Longest edge of a mesh whose vertices are to be moved, as a share of its diameter, and how many
+# times as long edges may be before they are divided.
+_LONGEST, _LONG = 0.015, 4.0
 
 # Lengths are stated for bodies of this diameter, world units.
 _STATED_FOR = 2.6
@@ -94,9 +96,7 @@ class SingleObject:
     def pose(self, x: Float[np.ndarray, " unknowns"]) -> Candidate:
         """Returns the object in air."""
         posed = self.shape.pose(x[: -self._extra])
-        padded = Posed(
-            *posed[:4], *(_widened(each, self._extra) for each in (posed[4], posed[5]))
-        )
+        padded = Posed(*posed[:4], *(_widened(each, self._extra) for each in (posed[4], posed[5])))
         by_index, by_tint = np.zeros((1, len(x))), np.zeros((3, len(x)))
         by_index[0, -self._extra] = 1.0
         tint = np.ones(3)
@@ -107,6 +107,11 @@ class SingleObject:
         derivatives = (scipy.sparse.csr_array(each) for each in (by_index, by_tint))
         index, tints = derivatives
         return Candidate((padded,), interfaces, index, tints if self.tinted else tints[:0])
+
+    @property
+    def index_at(self) -> int:
+        """Place of the index among the unknowns, from the end."""
+        return -self._extra
 
     def index_of(self, x: Float[np.ndarray, " unknowns"]) -> float:
         """Returns the index of refraction."""
@@ -172,45 +177,81 @@ def find_index(
     """
     if not len(pixels.views):
         raise ReconstructionError("No pixel sees the object. Check the masks and the cameras.")
-    few = pixels.chosen(_spread(len(pixels.views), _LOOK, seed))
-    seen = photometry.blurred(surface, _LOOK_BLUR)
+    glass = _Glass(mesh, surface, pixels, seed)
     ladder = rungs(search)
-    total = len(ladder) + (search.descents + (start is not None)) * len(_INDEX_BLURS) + 3
+    total = most_looks_at_backdrop(search, start=start)
     heights = []
     for number, rung in enumerate(ladder):
-        heights.append(float(_errors_at(mesh, rung, seen, few).mean()))
+        heights.append(glass.error(rung, _LOOK_BLUR))
         progress(number + 1, total)
     starts = [ladder[i] for i in lowest_rungs(heights, search.descents)]
     starts += [] if start is None else [start]
-    settings = Steps(_INDEX_BLURS, rays=_LOOK, judges=_LOOK, seed=seed)
     ways = []
     for number, begin in enumerate(starts):
-        model = SingleObject(FixedShape(mesh), begin, deviation=search.spacing)
-        found = gauss_newton.fit(model, model.start(), surface, pixels, settings=settings)
-        index = min(max(model.index_of(found.x), search.lowest), search.highest)
-        error = float(_errors_at(mesh, index, surface, few).mean())
-        ways.append(Descent((begin, index), (found.steps[0].before, error)))
+        ways.append(glass.descend(begin, search))
         progress(len(ladder) + (number + 1) * len(_INDEX_BLURS), total)
     ways.sort(key=lambda way: way.errors[-1])
     best = ways[0].indices[-1]
-    many = pixels.chosen(_spread(len(pixels.views), 4 * _LOOK, seed))
-    triple = [_errors_at(mesh, best + side * _APART, surface, many) for side in (-1.0, 0.0, 1.0)]
-    deviation = scatter_of_bottoms(np.stack(triple), many.views, _APART)
+    deviation = glass.deviation(best)
     progress(total, total)
-    ladder_seen = Descent(ladder, tuple(heights))
-    return IndexEstimate(best, deviation, ways[0].errors[-1], ladder_seen, tuple(ways))
+    seen = Descent(ladder, tuple(heights))
+    return IndexEstimate(best, deviation, ways[0].errors[-1], seen, tuple(ways))
+
+
+def most_looks_at_backdrop(search: IndexSearch, *, start: float | None = None) -> int:
+    """Returns the number of looks and steps of `find_index`."""
+    begins = search.descents + (start is not None)
+    return len(rungs(search)) + begins * len(_INDEX_BLURS) + 3
+
+
+class _Glass:
+    """An object of known shape, whose index is looked for."""
+
+    def __init__(self, mesh: Mesh, surface: Backdrop, pixels: Photographs, seed: int) -> None:
+        """Builds the scene once, for all indices."""
+        self.model = SingleObject(FixedShape(mesh), INDEX_OF_AIR, deviation=1.0)
+        self.body = gauss_newton.body_of(self.model.pose(self.model.start()))
+        self.surface = surface
+        self.few = pixels.chosen(_spread(len(pixels.views), _LOOK, seed))
+        self.many = pixels.chosen(_spread(len(pixels.views), 4 * _LOOK, seed))
+
+    def at(self, index: float) -> Body:
+        """Returns the scene with an index."""
+        scene = self.body.scene
+        interfaces = self.model.pose(np.array([index])).interfaces
+        return self.body._replace(scene=scene._replace(interfaces=interfaces))
+
+    def error(self, index: float, blur: int) -> float:
+        """Returns the mean error at an index."""
+        seen = photometry.blurred(self.surface, blur)
+        return float(gauss_newton.errors_of(self.at(index), seen, self.few).mean())
+
+    def descend(self, begin: float, search: IndexSearch) -> Descent:
+        """Takes Gauss-Newton steps, none longer than a rung."""
+        indices, errors = [begin], [self.error(begin, 0)]
+        for blur in _INDEX_BLURS:
+            x, seen = np.array([indices[-1]]), photometry.blurred(self.surface, blur)
+            light = gauss_newton.linearise(
+                self.model.pose(x), self.at(x[0]), seen, self.few, Steps()
+            )
+            step = -float(light.gradient[0] / max(light.matrix[0, 0], 1e-30))
+            step = min(max(step, -search.spacing), search.spacing)
+            indices.append(min(max(indices[-1] + step, search.lowest), search.highest))
+            errors.append(self.error(indices[-1], 0))
+        return Descent(tuple(indices), tuple(errors))
+
+    def deviation(self, index: float) -> float:
+        """Returns the standard deviation of the minimum."""
+        triple = [
+            gauss_newton.errors_of(self.at(index + side * _APART), self.surface, self.many)
+            for side in (-1.0, 0.0, 1.0)
+        ]
+        return scatter_of_bottoms(np.stack(triple), self.many.views, _APART)
 
 
 def _spread(every: int, count: int, seed: int) -> Int[np.ndarray, " some"]:
     """Draws some of many."""
     return np.random.default_rng((seed, count)).choice(every, min(every, count), replace=False)
-
-
-def _errors_at(
-    mesh: Mesh, index: float, surface: Backdrop, pixels: Photographs
-) -> Float[np.ndarray, " rays"]:
-    model = SingleObject(FixedShape(mesh), index)
-    return gauss_newton.errors_of(model.pose(model.start()), surface, pixels)
 
 
 class Trial(NamedTuple):
@@ -239,6 +280,12 @@ class Trial(NamedTuple):
         return self.model.index_of(self.fit.x)
 
     @property
+    def index_variance(self) -> float:
+        """Variance of the index of refraction."""
+        at = self.model.index_at
+        return float(self.fit.covariance[at, at])
+
+    @property
     def mesh(self) -> Mesh:
         """The surface."""
         return self.model.mesh(self.fit.x)
@@ -254,7 +301,7 @@ def fit_shapes(
     deviation: float = _INDEX_DEVIATION,
     outlines: Outlines | None = None,
     seed: int = 0,
-    progress: Callable[[str, int, StepFacts | None], None] = lambda name, step, facts: None,
+    progress: Callable[[float, str], None] = lambda share, text: None,
 ) -> tuple[Trial, ...]:
     """Fits the families that come near a mesh to photographs, the fewest unknowns first.
 
@@ -270,64 +317,93 @@ def fit_shapes(
       deviation: standard deviation of the index; 0 keeps it.
       outlines: equations of the masks' outlines.
       seed: seed of the draws.
-      progress: called with the name of the shape, the number of steps, and what the last one did.
+      progress: called with the share of the work that is done, and a line of text.
     """
+    task = _Task(surface, pixels, judges, outlines, deviation, seed)
     fixed = SingleObject(FixedShape(mesh), index, deviation=deviation)
     nothing = Fit(fixed.start(), np.full((1, 1), deviation**2), ())
-    trials = [Trial("masks", fixed, nothing, _by_view(fixed.pose(nothing.x), surface, judges))]
+    trials = [task.judged("masks", fixed, nothing)]
     blur = first_blur(fixed.pose(nothing.x), surface, judges)
-    family = Steps((*range(blur, 0, -1), *[0] * _FAMILY_STEPS), rays=_FAMILY_RAYS, seed=seed)
     *few, free = families.candidates(mesh)
+    count = blur + _FAMILY_STEPS
+    total, done = (count + 2) * len(few) + blur + sum(_GROUPS) + 4, 0
     for shape in few:
+        begin, label = done, shape.name
+        blurs = (*range(blur, 0, -1), *[0] * _FAMILY_STEPS)
         model = SingleObject(shape, index, deviation=deviation)
-        report = _named(progress, shape.name)
-        fit = gauss_newton.fit(
-            model, model.start(), surface, pixels, settings=family, outlines=outlines,
-            progress=report,
+        fit = task.fit(
+            model,
+            Steps(blurs, rays=_FAMILY_RAYS, seed=seed),
+            lambda step, facts, begin=begin, label=label: progress(
+                (begin + step) / total, _told(label, facts)
+            ),
         )
-        trials.append(Trial(shape.name, model, fit, _by_view(model.pose(fit.x), surface, judges)))
+        trials.append(task.judged(shape.name, model, fit))
+        done += count + 2
     best = min(trials, key=lambda trial: trial.error)
     trials.append(
-        _fit_free(best, surface, pixels, judges, outlines, deviation, seed,
-                  blur if best is trials[0] else 0, _named(progress, free.name))
+        _fit_free(
+            task,
+            best,
+            blur if best is trials[0] else 0,
+            lambda step, facts: progress(min((done + step) / total, 1.0), _told(free.name, facts)),
+        )
     )
+    progress(1.0, "done")
     return tuple(trials)
 
 
-def _named(
-    progress: Callable[[str, int, StepFacts | None], None], name: str
-) -> Callable[[int, StepFacts], None]:
-    return lambda step, facts: progress(name, step, facts)
+def _told(name: str, facts: StepFacts) -> str:
+    return f"{name}: error {min(facts.before, facts.after):.4f}"
+
+
+class _Task(NamedTuple):
+    """What all shapes are fitted to."""
+
+    surface: Backdrop
+    pixels: Photographs
+    judges: Photographs
+    outlines: Outlines | None
+    deviation: float
+    seed: int
+
+    def fit(
+        self, model: SingleObject, settings: Steps, progress: Callable[[int, StepFacts], None]
+    ) -> Fit:
+        """Fits one model."""
+        return gauss_newton.fit(
+            model,
+            model.start(),
+            self.surface,
+            self.pixels,
+            settings=settings,
+            outlines=self.outlines,
+            progress=progress,
+        )
+
+    def judged(self, name: str, model: SingleObject, fit: Fit) -> Trial:
+        """Returns a fitted model with the errors of the judges."""
+        return Trial(name, model, fit, _by_view(model.pose(fit.x), self.surface, self.judges))
 
 
 def _fit_free(
-    start: Trial,
-    surface: Backdrop,
-    pixels: Photographs,
-    judges: Photographs,
-    outlines: Outlines | None,
-    deviation: float,
-    seed: int,
-    blur: int,
-    progress: Callable[[int, StepFacts], None],
+    task: _Task, start: Trial, blur: int, progress: Callable[[int, StepFacts], None]
 ) -> Trial:
     """Fits a free surface, from the mesh of masks or from a family."""
     mesh, index, done = _with_many_vertices(start.mesh), start.index, 0
-    from_masks = start.name == "masks"
-    smoothings = _SMOOTHINGS if from_masks else (0.0,)
+    smoothings = _SMOOTHINGS if start.name == "masks" else (0.0,)
     for number, smoothing in enumerate(smoothings):
         if smoothing:
             mesh = diffuse(mesh, smoothing * diameter(mesh.vertices) / _STATED_FOR)
-        model = SingleObject(FreeSurface(mesh), index, deviation=deviation)
+        model = SingleObject(FreeSurface(mesh), index, deviation=task.deviation)
         coarse = tuple(range(blur, 0, -1)) if number == 0 else ()
-        settings = Steps((*coarse, *[0] * _GROUPS[number]), seed=seed + number)
-        fit = gauss_newton.fit(
-            model, model.start(), surface, pixels, settings=settings, outlines=outlines,
-            progress=lambda step, facts, before=done: progress(before + step, facts),
+        settings = Steps((*coarse, *[0] * _GROUPS[number]), seed=task.seed + number)
+        fit = task.fit(
+            model, settings, lambda step, facts, before=done: progress(before + step, facts)
         )
         done += len(settings.blurs)
         mesh, index = model.mesh(fit.x), model.index_of(fit.x)
-    return Trial(model.shape.name, model, fit, _by_view(model.pose(fit.x), surface, judges))
+    return task.judged(model.shape.name, model, fit)
 
 
 def _with_many_vertices(mesh: Mesh) -> Mesh:
@@ -335,7 +411,7 @@ def _with_many_vertices(mesh: Mesh) -> Mesh:
     corners = mesh.vertices[mesh.faces]
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)
     longest = _LONGEST * diameter(mesh.vertices)
-    if edges.max() <= 4.0 * longest:
+    if edges.max() <= _LONG * longest:
         return mesh
     found = Trimesh(*subdivide_to_size(mesh.vertices, mesh.faces, longest, max_iter=30))
     found.merge_vertices()
@@ -346,21 +422,37 @@ def _by_view(
     candidate: Candidate, surface: Backdrop, judges: Photographs
 ) -> Float[np.ndarray, " views"]:
     """Returns the mean error of each view that has judges."""
-    errors = gauss_newton.errors_of(candidate, surface, judges)
+    errors = gauss_newton.errors_of(gauss_newton.body_of(candidate), surface, judges)
     _, views = np.unique(judges.views, return_inverse=True)
     return np.bincount(views, errors) / np.bincount(views)
 
 
-def choose(trials: Sequence[Trial]) -> Trial:
-    """Returns the trial of fewest unknowns that is not worse than the best by two standard errors.
+class Comparison(NamedTuple):
+    """How much worse one trial is than another.
 
-    The error of the difference is that of its mean over views.
+    Attributes:
+      mean: mean difference of the errors of views, sRGB.
+      error: standard error of the mean.
     """
+
+    mean: float
+    error: float
+
+
+def compare(trial: Trial, best: Trial) -> Comparison:
+    """Returns how much worse a trial is than the best, by the judges of each view."""
+    difference = trial.by_view - best.by_view
+    count = len(difference)
+    error = float(difference.std(ddof=1)) / math.sqrt(count) if count > 1 else 0.0
+    return Comparison(float(difference.mean()), error)
+
+
+def choose(trials: Sequence[Trial]) -> Trial:
+    """Returns the trial of fewest unknowns that is not worse than the best by two standard errors."""
     best = min(trials, key=lambda trial: trial.error)
     for trial in sorted(trials, key=lambda trial: len(trial.fit.x)):
-        difference = trial.by_view - best.by_view
-        error = difference.std(ddof=1) / math.sqrt(len(difference)) if len(difference) > 1 else 0.0
-        if difference.mean() <= 2.0 * error:
+        worse = compare(trial, best)
+        if worse.mean <= 2.0 * worse.error:
             return trial
     return best
 

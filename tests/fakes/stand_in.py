@@ -84,7 +84,7 @@ def _evaluate(run, options):
 def _reconstruct(run, options):
     index = {"source": "estimated", "index": 1.5, "error": 0.01, "loss": 0.1}
     config = dict.fromkeys(("index", "space", "radius"))
-    config |= {"geometry": "hull", "resolution": 16, "outliers": 0, "light_steps": 0, "seed": 0}
+    config |= {"geometry": "hull", "resolution": 16, "outliers": 0, "refinement": "none", "seed": 0}
     record = {"scene": "made", "inputs": "", "config": config, "index": index}
     _write(run / "reconstruction.json", json.dumps(record))
 

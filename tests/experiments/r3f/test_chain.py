@@ -31,7 +31,7 @@ from tests.factories.silhouettes import RADIUS, without_masks, write_scene
 
 pytestmark = [pytest.mark.longest, pytest.mark.computing]
 
-_CONFIG = ReconstructionConfig("hull", 20, 0, 1.5, None, None, 0, 0)
+_CONFIG = ReconstructionConfig("hull", 20, 0, 1.5, None, None, "none", 0)
 
 
 @pytest.fixture(scope="module")

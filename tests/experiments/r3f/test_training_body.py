@@ -28,7 +28,7 @@ def scene(tmp_path_factory):
 def made(scene, tmp_path_factory):
     """A reconstruction of it."""
     out = tmp_path_factory.mktemp("made") / "r3f"
-    config = ReconstructionConfig("hull", 20, 0, 1.45, None, None, 0, 0)
+    config = ReconstructionConfig("hull", 20, 0, 1.45, None, None, "none", 0)
     chain.reconstruct(scene, out, config, compare=False, say=lambda text: None)
     return out
 
