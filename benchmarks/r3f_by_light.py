@@ -1,0 +1,177 @@
+"""Claim: light refines shape and index until they are nearly as good as the true ones.
+
+    python -m benchmarks.r3f_by_light --scenes=FOLDER,FOLDER [--limit=N] [--field_steps=N]
+
+Each scene is reconstructed from its images and masks as `experiments.reconstruct` does. The first
+table has, for the surface from masks, for every shape that light fitted and for the scene's own
+mesh, the mean error of pixels that were not fitted, the index of refraction, and the angle between
+its normals and the true ones. The second has the results of training with the reconstruction, and
+with the scene's own meshes: PSNR in the mask on the test split, with a backdrop and, with
+`--field_steps`, with a field. Finished reconstructions and trainings are reused.
+
+Asserted are the bounds of `_MUST` for the scenes named there, and for all others that light is no
+worse than masks.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from absl import app, flags
+
+from experiments.cli import subprocesses
+from experiments.r3f import object_source, records
+from experiments.r3f.records import Reconstruction
+from experiments.runs import measured_runs
+from refref_jax.data import meshes
+from refref_jax.data.scene_assembly import shaded_mesh
+from refref_jax.reconstruct.mesh_distance import Distance, compare_meshes
+
+_SCENES = flags.DEFINE_list("scenes", ["experiments/data/cube_smcvx_ball"], "Folders of scenes.")
+_LIMIT = flags.DEFINE_integer("limit", 8, "Number of test images, evenly spaced.", 1)
+_RAYS_PER_PIXEL = flags.DEFINE_integer("rays_per_pixel", 4, "Rays per pixel in evaluation.", 1)
+_FIELD_STEPS = flags.DEFINE_integer("field_steps", 0, "Steps of a field; 0 trains none.", 0)
+_OUT = flags.DEFINE_string("out", "runs/r3f_by_light", "Output folder.")
+
+
+class Bounds(NamedTuple):
+    """What must hold on a scene: largest errors, and least masked PSNR.
+
+    Attributes:
+      normals: mean angle between normals, degrees.
+      normals_99: the angle that 99 of 100 are below.
+      index: error of the index of refraction.
+      psnr: masked PSNR with a backdrop, dB; `None` if no bound is stated.
+    """
+
+    normals: float
+    normals_99: float
+    index: float
+    psnr: float | None
+
+
+_MUST = {
+    "torus": Bounds(0.25, 1.2, 0.003, 32.0),
+    "ball": Bounds(0.16, 0.6, 0.001, 34.7),
+    "cylinder": Bounds(0.5, 4.0, 0.003, 24.0),
+}
+"""Bounds by object."""
+
+
+class Row(NamedTuple):
+    """One surface: how well it explains pixels, and how far it is from the truth."""
+
+    shape: str
+    error: float | None
+    index: float
+    deviation: float | None
+    distance: Distance | None
+
+
+def main(arguments: list[str]) -> None:
+    del arguments
+    wrong = []
+    print("| scene | surface | error, sRGB | index | normals, degrees: mean, 99 % | Chamfer, % |")
+    print("|---|---|---|---|---|---|", flush=True)
+    scenes = [Path(scene) for scene in _SCENES.value]
+    for scene in scenes:
+        wrong += _measure(scene)
+    print("\n| scene | background | masks | light | true meshes |")
+    print("|---|---|---|---|---|", flush=True)
+    for scene in scenes:
+        wrong += _train_all(scene)
+    assert not wrong, "; ".join(wrong)
+
+
+def _folder(scene: Path) -> Path:
+    return Path(_OUT.value) / scene.resolve().name
+
+
+def _measure(scene: Path) -> list[str]:
+    """Reconstructs a scene, prints its surfaces, and returns what is out of bounds."""
+    name, out = scene.resolve().name, _folder(scene) / "reconstruction"
+    command = [f"--scene={scene}", f"--out={out}"]
+    subprocesses.run("reconstruct", *command, log=_folder(scene) / "reconstruct.log")
+    found = records.read(out)
+    parts = meshes.read_meshes(scene)
+    rows = _rows(out, found, parts)
+    for row in rows:
+        print(_line(name, row), flush=True)
+    masks, light = rows[0], rows[-1]
+    if light.error is not None and masks.error is not None and light.error > masks.error:
+        return [f"{name}: light is worse than masks"]
+    must = _MUST.get(name.split("_", 2)[-1])
+    if must is None or light.distance is None:
+        return []
+    within = {
+        "normals": light.distance.normal_error <= must.normals,
+        "99 % of the normals": light.distance.normal_error_99 <= must.normals_99,
+        "index": abs(light.index - parts[0].index) <= must.index,
+    }
+    return [f"{name}: {what} out of bounds" for what, holds in within.items() if not holds]
+
+
+def _rows(out: Path, found: Reconstruction, parts: Sequence[meshes.MeshPart]) -> tuple[Row, ...]:
+    """Returns the surface from masks, and the one that is used."""
+    truth = shaded_mesh(parts[0]) if len(parts) == 1 else None
+    rows = []
+    for facts in (dataclasses.replace(found, light=None), found):
+        mesh, light = object_source.read_mesh(out, facts), found.light
+        index = object_source.index_facts(facts)
+        error = None if light is None else (light.before if facts.light is None else light.after)
+        shape = "masks" if facts.light is None or light is None else light.shape
+        distance = None if truth is None else compare_meshes(mesh, truth)
+        rows.append(Row(shape, error, index.index, index.error, distance))
+    return tuple(rows)
+
+
+def _line(name: str, row: Row) -> str:
+    error = "" if row.error is None else f"{row.error:.4f}"
+    deviation = "" if row.deviation is None else f" ± {row.deviation:.5f}"
+    line = f"| {name} | {row.shape} | {error} | {row.index:.4f}{deviation} "
+    if row.distance is None:
+        return f"{line}| | |"
+    angles = f"{row.distance.normal_error:.3f}, {row.distance.normal_error_99:.2f}"
+    return f"{line}| {angles} | {100.0 * row.distance.chamfer:.4f} |"
+
+
+def _train_all(scene: Path) -> list[str]:
+    """Trains with each object, prints masked PSNR, and returns what is out of bounds."""
+    name, out = scene.resolve().name, _folder(scene) / "reconstruction"
+    masks = _folder(scene) / "masks"
+    options = [f"--scene={scene}", f"--out={masks}", "--refinement=none"]
+    options.append(f"--ior={records.read(out).index.index}")
+    subprocesses.run("reconstruct", *options, log=_folder(scene) / "masks.log")
+    objects = {
+        "masks": [f"--reconstruction={masks}"],
+        "light": [f"--reconstruction={out}"],
+        "true": [],
+    }
+    worlds = {"backdrop": ["--far_field=backdrop"]}
+    if _FIELD_STEPS.value:
+        steps = ["--preset=tiny", f"--steps={_FIELD_STEPS.value}"]
+        worlds["field"] = ["--far_field=field", *steps]
+    wrong = []
+    for world, more in worlds.items():
+        found = {
+            kind: _masked(scene, f"{world}_{kind}", [*given, *more, "--paths=tree"])
+            for kind, given in objects.items()
+        }
+        cells = " | ".join(f"{psnr:.2f}" for psnr in found.values())
+        print(f"| {name} | {world} | {cells} |", flush=True)
+        must = _MUST.get(name.split("_", 2)[-1])
+        if world == "backdrop" and must and must.psnr and found["light"] < must.psnr:
+            wrong.append(f"{name}: {found['light']:.2f} dB in the mask, {must.psnr} wanted")
+    return wrong
+
+
+def _masked(scene: Path, name: str, options: Sequence[str]) -> float:
+    run = _folder(scene) / name
+    measured_runs.train(run, scene=scene, options=options)
+    looks = [f"--rays_per_pixel={_RAYS_PER_PIXEL.value}", f"--limit={_LIMIT.value}"]
+    return measured_runs.evaluate(run, scene=scene, options=looks).psnr_masked
+
+
+if __name__ == "__main__":
+    app.run(main)
