@@ -1,7 +1,7 @@
 """Families of closed surfaces with few unknowns, fitted to noisy meshes (NumPy only).
 
 A mesh from masks is wrong by up to a few percent of a face's length, so its normals are off by
-degrees. If the object is a ball, a torus or a vase, the right few numbers describe it without
+degrees. If the object is a ball, a cylinder or a vase, the right few numbers describe it without
 noise. `candidates` returns the families that come near a mesh as shapes (`shapes`), whose unknowns
 a solver then fits to images.
 
@@ -11,7 +11,6 @@ Sources: Pottmann and Randrup (1998) for axes, see `revolution`; the rest is our
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -25,13 +24,11 @@ from refref_jax.reconstruct.polyhedra import fit_polyhedron
 from refref_jax.reconstruct.revolution import (
     Axis,
     Curve,
-    Lathe,
     Profile,
     find_axis,
     fit_axis_and_profile,
     lathe,
     profile_normals,
-    sweep,
 )
 from refref_jax.reconstruct.shapes import (
     FURTHEST,
@@ -48,6 +45,8 @@ from refref_jax.reconstruct.shapes import (
     robust_weights,
     tilt,
 )
+from refref_jax.reconstruct.turned import Turned, place, place_on_axis
+from refref_jax.reconstruct.turned_fit import fit_turned
 
 # Standard deviations of the priors: positions and radii, as shares of the diameter, and angles, in
 # radians. Offsets of a profile: second differences between knots, and their size.
@@ -206,7 +205,7 @@ class Revolution:
         """Returns zeros: the axis and the profile of the fit."""
         return np.zeros(4 + _KNOTS)
 
-    def profile(self, unknowns: Unknowns) -> "Turned":
+    def profile(self, unknowns: Unknowns) -> Turned:
         """Returns points and normals of the profile, and their derivatives by the offsets."""
         points = self.points + self._slopes @ unknowns[4:]
         along = np.stack([m @ points[:, i] for i, m in enumerate(self._along)], axis=-1)
@@ -218,13 +217,8 @@ class Revolution:
 
     def pose(self, unknowns: Unknowns) -> Posed:
         """Returns the body; its vertices lie on the spline."""
-        shift = np.append(unknowns[:4], 0.0)
-        posed = place(self.profile(unknowns), self._lathe, _AROUND_AXIS, self.axis, shift)
-        # A shift along the axis is an offset of the profile.
-        return posed._replace(
-            by_vertices=np.delete(posed.by_vertices, 4, axis=1),
-            by_normals=np.delete(posed.by_normals, 4, axis=1),
-        )
+        turned = self.profile(unknowns)
+        return place_on_axis(turned, self._lathe, _AROUND_AXIS, self.axis, unknowns[:4])
 
     def prior(self, unknowns: Unknowns) -> tuple[Matrix, Unknowns]:
         """Returns the prior: a small change of the axis, small offsets, and smaller bends.
@@ -244,59 +238,6 @@ class Revolution:
     def scales(self) -> Unknowns:
         """Returns 0.02 radians and 0.77 % of the diameter."""
         return np.repeat([LARGEST_TURN, LARGEST_STEP * self._size], [2, 2 + _KNOTS])
-
-
-class Turned(NamedTuple):
-    """A profile and its derivatives by m unknowns.
-
-    Attributes:
-      points: radius and height.
-      by_points: derivatives of the points.
-      normals: outward unit normals at the points.
-      by_normals: derivatives of the normals.
-    """
-
-    points: Float[np.ndarray, "points 2"]
-    by_points: Float[np.ndarray, "points 2 m"]
-    normals: Float[np.ndarray, "points 2"]
-    by_normals: Float[np.ndarray, "points 2 m"]
-
-
-def place(
-    turned: Turned, connected: Lathe, azimuths: int, axis: Axis, pose: Float[np.ndarray, "5"]
-) -> Posed:
-    """Turns a profile around an axis that is tilted and shifted.
-
-    Args:
-      turned: profile relative to the point of the axis.
-      connected: connectivity.
-      azimuths: number of half-planes.
-      axis: axis at rest.
-      pose: two angles of the tilt, and the shift in the frame of the axis.
-
-    Returns:
-      The surface; unknowns are the pose and then those of the profile.
-    """
-    rotations = [axis.frame @ rotation for rotation in tilt(pose[:2])]
-
-    def turn(values: Curve, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        swept, moved = sweep(values, slopes, rotations[0], azimuths)
-        local = swept @ rotations[0]
-        tilted = np.stack([local @ rotation.T for rotation in rotations[1:]], axis=-1)
-        return swept, np.concatenate([tilted, np.zeros((*swept.shape, 3)), moved], axis=-1)
-
-    vertices, by_vertices = turn(turned.points, turned.by_points)
-    by_vertices[..., 2:5] = axis.frame
-    normals, by_normals = turn(turned.normals, turned.by_normals)
-    rows = connected.rows
-    return Posed(
-        axis.point + axis.frame @ pose[2:] + vertices[rows],
-        connected.faces,
-        normals,
-        connected.normal_ids,
-        by_vertices[rows].reshape(3 * len(rows), -1),
-        by_normals.reshape(3 * len(normals), -1),
-    )
 
 
 def _turn_right(along: np.ndarray) -> np.ndarray:
@@ -483,6 +424,12 @@ def candidates(mesh: Mesh) -> list[Shape]:
       ReconstructionError: if the mesh is empty, flat, inside out or not finite, or
         scikit-image is not installed.
     """
-    fits = (fit_sphere(mesh), fit_torus(mesh), fit_revolution(mesh), fit_polyhedron(mesh))
+    fits = (
+        fit_sphere(mesh),
+        fit_torus(mesh),
+        fit_turned(mesh),
+        fit_revolution(mesh),
+        fit_polyhedron(mesh),
+    )
     found: list[Shape] = [fit for fit in fits if fit is not None]
     return [*sorted(found, key=lambda shape: len(shape.start())), FreeSurface(mesh)]

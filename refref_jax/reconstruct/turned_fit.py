@@ -1,0 +1,226 @@
+"""Fits turned bodies of straight pieces to noisy meshes (NumPy only).
+
+`segments` finds corners in the smooth profile of a surface of revolution. Least squares then find
+axis, corners and fillets, and corners that the mesh does not need go.
+
+Source: ours.
+"""
+
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import least_squares
+from scipy.spatial import KDTree
+
+from refref_jax.geometry.triangle_meshes import Mesh, diameter
+from refref_jax.reconstruct.revolution import Axis, Fit, fit_axis_and_profile
+from refref_jax.reconstruct.segments import find_corners
+from refref_jax.reconstruct.shapes import (
+    FURTHEST,
+    Cloud,
+    Unknowns,
+    cloud_of,
+    frame_along,
+    rms,
+    tilt,
+)
+from refref_jax.reconstruct.turned import StraightTurned, rounded
+
+# Steps of each straight piece and of each arc where a profile is compared with a mesh.
+_FINE = 96, 24
+
+# Most corners of a profile.
+_MOST_CORNERS = 12
+
+# Deviation of a profile from an ideal one: share of the error of the mesh, and the least, as a
+# share of the diameter.
+_DEVIATION, _LEAST_DEVIATION = 0.4, 4e-4
+
+# A body is accepted if its error is at most this multiple of that of the smooth profile, or this
+# share of the diameter more, and if this share of its profile is straight.
+_WORSE, _MORE = 1.2, 3e-4
+_STRAIGHT_SHARE = 0.5
+
+# Weight of the first guess against the mesh, its smallest fillet as a share of the diameter, and
+# most evaluations.
+_RIDGE = 1e-3
+_FIRST_FILLET = 0.01
+_EVALUATIONS = 25
+
+# Samples of a mesh, at most.
+_SAMPLES = 20_000
+
+# A corner that turns by less (radians) may go. A piece between two turns to the same side, of less
+# than this in all, becomes one fillet if it is shorter than the first of two shares of the
+# diameter; or than the second, and the error grows by less than this multiple, or this share.
+_NO_TURN, _ONE_TURN = 0.15, 2.2
+_BEVEL, _SHORT = 0.035, 0.1
+_TIMES, _PLUS = 1.02, 5e-5
+
+
+def fit_turned(
+    mesh: Mesh, *, furthest: float = FURTHEST, smooth: Fit | None = None
+) -> StraightTurned | None:
+    """Fits a turned body of straight pieces: corners of a smooth profile, then least squares.
+
+    The corners are those of `segments.find_corners`. Axis, corners and fillets then have the least
+    robust squared distances from the mesh.
+
+    Args:
+      mesh: closed mesh, in one piece.
+      furthest: largest rms distance of the mesh from the body, as a share of its diameter.
+      smooth: what `revolution.fit_axis_and_profile` found, if it is known.
+
+    Returns:
+      The body, or `None` if the mesh is further from it, or clearly further than from the smooth
+      profile, or if less than half of the profile is straight or it has more than 12 corners.
+
+    Raises:
+      ReconstructionError: if the mesh is empty, flat, inside out or not finite, or
+        scikit-image is not installed.
+    """
+    cloud, size = cloud_of(mesh), diameter(mesh.vertices)
+    smooth = fit_axis_and_profile(mesh, cloud, size) if smooth is None else smooth
+    if smooth is None or smooth.rms > furthest * size:
+        return None
+    cloud = _some_of(cloud)
+    deviation = max(_DEVIATION * smooth.rms, _LEAST_DEVIATION * size)
+    corners = find_corners(smooth.profile, deviation, size)
+    if corners is None or len(corners.fillets) > _MOST_CORNERS:
+        return None
+    fillets = np.maximum(corners.fillets, _FIRST_FILLET * size)
+    shape = StraightTurned(smooth.axis, corners.points, fillets, size, closed=smooth.profile.closed)
+    while bevels := [one for length, one in _simpler(shape, size) if length < _BEVEL * size]:
+        shape = bevels[0]
+    shape, error = _simplified(*_adjusted(shape, cloud, size), cloud, size)
+    allowed = max(_WORSE * smooth.rms, smooth.rms + _MORE * size)
+    if error > min(furthest * size, allowed):
+        return None
+    return shape if shape.straight_share(shape.start()) >= _STRAIGHT_SHARE else None
+
+
+def _some_of(cloud: Cloud) -> Cloud:
+    """Returns at most 20,000 of the samples."""
+    chosen = np.random.default_rng(0).permutation(len(cloud.points))[:_SAMPLES]
+    areas = cloud.areas[chosen]
+    return Cloud(cloud.points[chosen], cloud.normals[chosen], areas / areas.sum())
+
+
+def _simplified(
+    shape: StraightTurned, error: float, cloud: Cloud, size: float
+) -> tuple[StraightTurned, float]:
+    """Returns the body after corners that the mesh does not need are gone; its error."""
+    simpler = _simpler(shape, size)
+    while simpler:
+        other, others = _adjusted(simpler.pop(0)[1], cloud, size)
+        if others < max(_TIMES * error, error + _PLUS * size):
+            shape, error, simpler = other, others, _simpler(other, size)
+    return shape, error
+
+
+def _simpler(shape: StraightTurned, size: float) -> list[tuple[float, StraightTurned]]:
+    """Returns bodies without one of the corners that hardly turn, or without one short piece.
+
+    A short piece between turns to one side becomes a fillet of the pieces around it. The length of
+    the piece (0 for a corner that hardly turns) comes before each body; they are sorted by it.
+    """
+    corners, fillets = shape.corners(shape.start()), shape.fillets(shape.start())
+    turns = rounded(corners, fillets, shape.closed).turns
+    if shape.closed:
+        turns, first = np.roll(turns, 1), 0
+    else:
+        turns, fillets, first = (
+            np.concatenate([[0.0], turns, [0.0]]),
+            np.concatenate([[0.0], fillets, [0.0]]),
+            1,
+        )
+    count, found = len(corners), []
+    for corner in range(first, count - first):
+        after = (corner + 1) % count
+        kept = np.arange(count) != after
+        if abs(turns[corner]) < _NO_TURN:
+            kept = np.arange(count) != corner
+            found.append((0.0, corners[kept], fillets[kept]))
+            continue
+        if after < first or after >= count - first or turns[corner] * turns[after] <= 0.0:
+            continue
+        length = float(np.linalg.norm(corners[after] - corners[corner]))
+        if length < _SHORT * size and abs(turns[corner] + turns[after]) < _ONE_TURN:
+            moved, wider = corners.copy(), fillets.copy()
+            moved[corner], wider[corner] = _one_corner(corners[(corner + np.arange(-1, 3)) % count])
+            found.append((length, moved[kept], wider[kept]))
+    return [
+        (
+            length,
+            StraightTurned(shape.axis, c, f[first : len(f) - first], size, closed=shape.closed),
+        )
+        for length, c, f in sorted(found, key=lambda each: each[0])
+        if len(c) > 2
+    ]
+
+
+def _one_corner(ends: Float[np.ndarray, "4 2"]) -> tuple[Float[np.ndarray, "2"], float]:
+    """Returns where the first and the last of three pieces meet, and the fillet of the middle."""
+    before, step, after = np.diff(ends, axis=0)
+    cross = before[0] * after[1] - before[1] * after[0]
+    met = ends[1] + before * (step[0] * after[1] - step[1] * after[0]) / cross
+    turn = np.arctan2(abs(cross), before @ after)
+    length = np.linalg.norm(ends[1:3] - met, axis=-1).mean()
+    return met, float(length / np.tan(0.5 * turn))
+
+
+def _adjusted(shape: StraightTurned, cloud: Cloud, size: float) -> tuple[StraightTurned, float]:
+    """Returns the body after least squares of distances, and its rms distance from the samples."""
+    local = (cloud.points - shape.axis.point) @ shape.axis.frame
+    root, first = np.sqrt(cloud.areas), shape.start()
+    units = np.repeat([1.0, size], [2, len(first) - 2])
+
+    def errors(x: Unknowns) -> Float[np.ndarray, " equations"]:
+        apart = _distances(shape, first + units * x, local)[0] / size
+        return np.concatenate([root * apart, _RIDGE * x])
+
+    def slopes(x: Unknowns) -> Float[np.ndarray, "equations n"]:
+        by = _distances(shape, first + units * x, local)[1] * units / size
+        return np.concatenate([root[:, None] * by, _RIDGE * np.eye(len(x))])
+
+    nothing = np.zeros(len(first))
+    scale = 1.5 * float(np.median(np.abs(errors(nothing)[: len(root)])))
+    found = least_squares(
+        errors,
+        nothing,
+        slopes,
+        loss="soft_l1",
+        f_scale=max(scale, 1e-9),
+        max_nfev=_EVALUATIONS,
+    ).x
+    x = first + units * found
+    axis = Axis(
+        shape.axis.point + shape.axis.frame[:, :2] @ x[2:4],
+        frame_along(shape.axis.frame @ tilt(x[:2])[0][:, 2]),
+    )
+    better = StraightTurned(axis, shape.corners(x), shape.fillets(x), size, closed=shape.closed)
+    return better, rms(_distances(shape, x, local)[0], cloud.areas)
+
+
+def _distances(
+    shape: StraightTurned, unknowns: Unknowns, local: Float[np.ndarray, "points 3"]
+) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, "points n"]]:
+    """Returns distances of points from the body, positive outside, and their derivatives.
+
+    A distance is along the normal of the nearest of many points of the profile, so it does not
+    change if that point moves along the profile.
+    """
+    turned = shape.profile(unknowns, *_FINE)
+    rotation, *slopes = tilt(unknowns[:2])
+    away = local - [*unknowns[2:4], 0.0]
+    points = away @ rotation
+    radius = np.maximum(np.linalg.norm(points[:, :2], axis=-1), 1e-300)
+    flat = np.stack([radius, points[:, 2]], axis=-1)
+    nearest = KDTree(turned.points).query(flat)[1]
+    normals = turned.normals[nearest]
+    around = points[:, :2] / radius[:, None]
+    outward = np.concatenate([normals[:, :1] * around, normals[:, 1:]], axis=-1)
+    by_tilt = [np.sum(outward * (away @ slope), axis=-1) for slope in slopes]
+    by_shift = -(outward @ rotation.T)[:, :2]
+    moved = np.sum(turned.normals[..., None] * turned.by_points, axis=1)[nearest]
+    apart = np.sum((flat - turned.points[nearest]) * normals, axis=-1)
+    return apart, np.concatenate([np.stack(by_tilt, axis=-1), by_shift, -moved], axis=-1)
