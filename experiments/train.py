@@ -97,17 +97,17 @@ def _train(run: Path, asked: TrainConfig) -> bool:
 
     existing = "resume" if _RESUME.value else "refuse"
     resuming, mesh = fit.is_resumed(run, existing), processes.mesh(_DEVICES)
-    given, part, config = asked.scene.reconstruction, None, None
+    given, parts, config = asked.scene.reconstruction, None, None
     if resuming and _CONFIG["scene"].value is None:
         _refuse_flags(run)
     else:
-        config, part = _with_object(run, asked)
+        config, parts = _with_object(run, asked)
     interrupt, bar = app.Interrupt(), ProgressBar("train", 0)
     with contextlib.ExitStack() as stack:
 
         def ready() -> None:
             if not resuming and devices.is_first():
-                training_body.note(run, part, given)
+                training_body.note(run, parts, given)
             stack.enter_context(interrupt)
             stack.enter_context(bar)
 
@@ -115,7 +115,7 @@ def _train(run: Path, asked: TrainConfig) -> bool:
             run,
             config,
             existing=existing,
-            parts=None if part is None else [part],
+            parts=parts,
             ready=ready,
             progress=bar.move,
             stop=lambda: interrupt.requested,
@@ -124,17 +124,17 @@ def _train(run: Path, asked: TrainConfig) -> bool:
         )
 
 
-def _with_object(run: Path, asked: TrainConfig) -> tuple[TrainConfig, MeshPart | None]:
-    """Returns the configuration with the scene's folder, and the object if it is reconstructed."""
+def _with_object(run: Path, asked: TrainConfig) -> tuple[TrainConfig, list[MeshPart] | None]:
+    """Returns the configuration with the scene's folder, and a reconstructed object's parts."""
     if not asked.scene.path:
         raise ValueError("The configuration has no scene. Add --scene=FOLDER.")
     config = asked.at(str(cli_scenes.opened(asked.scene.path).resolve()))
     ior = _CONFIG["ior"].value or ()
-    part = training_body.find(run, config, ior=ior, resume=_RESUME.value)
-    if part is not None:
+    parts = training_body.find(run, config, ior=ior, resume=_RESUME.value)
+    if parts is not None:
         made = training_body.folder(run, config.scene.reconstruction)
-        config = training_body.with_part(config, part, made, ior=ior, say=print)
-    return config, part
+        config = training_body.with_parts(config, parts, made, ior=ior, say=print)
+    return config, parts
 
 
 def _refuse_flags(run: Path) -> None:

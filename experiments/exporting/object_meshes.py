@@ -11,6 +11,7 @@ from experiments.cli import outputs
 from experiments.exporting.field_mesh import split_parts
 from experiments.r3f import object_source, records
 from refref_jax.data import meshes
+from refref_jax.data.scene_assembly import shaded_mesh
 from refref_jax.geometry.triangle_meshes import Mesh
 from refref_jax.optics.scene import Scene
 from refref_jax.render.checkpoint_io import load_scene
@@ -32,7 +33,7 @@ def write(run: Path, out: Path, *, overwrite: bool) -> list[Path]:
       replaced.
     """
     if records.exists(run):
-        found = [object_source.read_mesh(run, _finished(run))]
+        found = [shaded_mesh(part) for part in object_source.read_parts(run, _finished(run))]
     else:
         found = read_meshes(load_scene(run))
     if not found:

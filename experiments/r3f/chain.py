@@ -72,8 +72,8 @@ def reconstruct(
     return found
 
 
-def read_part(out: Path) -> MeshPart:
-    """Reads the object of a finished reconstruction, with its index of refraction.
+def read_parts(out: Path) -> list[MeshPart]:
+    """Reads the parts of a finished reconstruction, with their indices of refraction.
 
     Raises:
       ValueError: if the folder contains no reconstruction, or an unfinished one.
@@ -84,12 +84,12 @@ def read_part(out: Path) -> MeshPart:
         found.geometry is None
         or found.index is None
         or waits_for_light
-        or not object_source.surface_file(out, found).is_file()
+        or not object_source.are_there(out, found)
     ):
         raise ValueError(
             f"The reconstruction in {out} is not finished. Repeat the command that started it."
         )
-    return object_source.read_part(out, found)
+    return object_source.read_parts(out, found)
 
 
 def fingerprint(scene: Path) -> str:
@@ -173,7 +173,7 @@ def _index(scene: Path, out: Path, found: Reconstruction) -> IndexFacts:
 
 def _refined(scene: Path, out: Path, found: Reconstruction, say: Say) -> Reconstruction:
     """Refines the object by light, if requested and not done yet."""
-    there = found.light is not None and object_source.surface_file(out, found).is_file()
+    there = found.light is not None and object_source.are_there(out, found)
     if found.config.refinement == "light" and not there:
         bare = dataclasses.replace(found, light=None, report=None)
         found = dataclasses.replace(bare, light=_light(scene, out, bare))

@@ -8,7 +8,7 @@ import dataclasses
 from pathlib import Path
 
 from experiments.r3f import geometry_stage, light_stage
-from experiments.r3f.records import IndexFacts, Reconstruction
+from experiments.r3f.records import IndexFacts, PartFacts, Reconstruction
 from refref_jax import configuration
 from refref_jax.data import meshes
 from refref_jax.data.meshes import MeshPart
@@ -46,10 +46,22 @@ def read(run: Path) -> Provenance | None:
 
 
 def surface_file(out: Path, found: Reconstruction) -> Path:
-    """Returns the path of the surface: the refined one if the refinement was kept."""
-    refined = found.light is not None and found.light.kept
-    folder = light_stage.FOLDER if refined else geometry_stage.FOLDER
-    return out / folder / found.geometry.mesh
+    """Returns the path of the outer surface: the refined one if the refinement was kept."""
+    if not _is_refined(found):
+        return out / geometry_stage.FOLDER / found.geometry.mesh
+    parts = found.light.parts
+    return out / light_stage.FOLDER / (parts[0].mesh if parts else found.geometry.mesh)
+
+
+def _is_refined(found: Reconstruction) -> bool:
+    return found.light is not None and found.light.kept
+
+
+def are_there(out: Path, found: Reconstruction) -> bool:
+    """Returns whether the files of all parts exist."""
+    parts = found.light.parts if _is_refined(found) else ()
+    files = [out / light_stage.FOLDER / part.mesh for part in parts]
+    return all(file.is_file() for file in (*files, surface_file(out, found)))
 
 
 def index_facts(found: Reconstruction) -> IndexFacts:
@@ -60,9 +72,18 @@ def index_facts(found: Reconstruction) -> IndexFacts:
     return IndexFacts("refined", found.light.index, found.light.deviation, None)
 
 
-def read_part(out: Path, found: Reconstruction) -> MeshPart:
-    """Reads the object as a mesh part with an index of refraction."""
-    return meshes.read_part(surface_file(out, found), index=index_facts(found).index)
+def read_parts(out: Path, found: Reconstruction) -> list[MeshPart]:
+    """Reads the object as mesh parts with their indices of refraction, the outermost first."""
+    if not _is_refined(found) or not found.light.parts:
+        return [meshes.read_part(surface_file(out, found), index=index_facts(found).index)]
+    return [_read(out / light_stage.FOLDER, part) for part in found.light.parts]
+
+
+def _read(folder: Path, facts: PartFacts) -> MeshPart:
+    part = meshes.read_part(folder / facts.mesh, index=facts.index)
+    if facts.tint is None:
+        return part
+    return part._replace(tint=facts.tint, colour_known=True)
 
 
 def read_mesh(out: Path, found: Reconstruction) -> Mesh:

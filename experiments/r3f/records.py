@@ -131,6 +131,21 @@ class TrialFacts:
 
 
 @dataclasses.dataclass(frozen=True)
+class PartFacts:
+    """One part of a refined object.
+
+    Attributes:
+      mesh: name of its file in the folder `light`.
+      index: index of refraction inside.
+      tint: factor of linear RGB light at every crossing of its surface; `None` if unknown.
+    """
+
+    mesh: str
+    index: float
+    tint: tuple[float, float, float] | None = None
+
+
+@dataclasses.dataclass(frozen=True)
 class LightFacts:
     """Results of the refinement by light.
 
@@ -146,6 +161,7 @@ class LightFacts:
       split: split of the views that judge.
       remark: reason why the surface was not refined.
       trials: all shapes that were fitted.
+      parts: parts of the object, the outermost first, if light found several.
     """
 
     kept: bool
@@ -158,6 +174,7 @@ class LightFacts:
     split: str = "val"
     remark: str = ""
     trials: tuple[TrialFacts, ...] = ()
+    parts: tuple[PartFacts, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)

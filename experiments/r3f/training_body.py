@@ -125,8 +125,10 @@ def given_index(ior: Sequence[str]) -> float | None:
     return refraction_indices.parse(ior[0])
 
 
-def find(run: Path, config: TrainConfig, *, ior: Sequence[str], resume: bool) -> MeshPart | None:
-    """Returns the reconstructed object, or `None` if the scene's meshes are used.
+def find(
+    run: Path, config: TrainConfig, *, ior: Sequence[str], resume: bool
+) -> list[MeshPart] | None:
+    """Returns the parts of the reconstructed object, or `None` if the scene's meshes are used.
 
     Unfinished stages of the reconstruction are run first.
 
@@ -150,15 +152,16 @@ def find(run: Path, config: TrainConfig, *, ior: Sequence[str], resume: bool) ->
             raise ValueError(
                 f"--out={run} is the reconstruction itself. Use another folder for the run."
             )
-        part = chain.read_part(out)
+        parts = chain.read_parts(out)
         if chain.fingerprint(scene) != records.read(out).inputs:
             print(
                 f"warning: {out} was reconstructed from other images, masks or poses than those of "
                 f"{scene}. Make sure that it is the same object in the same place, or reconstruct "
                 "the scene's object with --method=r3f and without --reconstruction."
             )
-        index = index or dict(config.scene.indices).get(part.name)
-        return part if index is None else part._replace(index=index)
+        known = dict(config.scene.indices)
+        outer, *inner = [part._replace(index=known.get(part.name, part.index)) for part in parts]
+        return [outer if index is None else outer._replace(index=index), *inner]
     if out.exists() and not resume:
         raise ValueError(
             f"{out} already contains a reconstruction. Continue with --resume, or change --out."
@@ -179,22 +182,28 @@ def find(run: Path, config: TrainConfig, *, ior: Sequence[str], resume: bool) ->
     except KeyboardInterrupt:
         print("Stopped. Continue with the same command and --resume.")
         raise
-    return chain.read_part(out)
+    return chain.read_parts(out)
 
 
-def with_part(
-    config: TrainConfig, part: MeshPart, made: Path, *, ior: Sequence[str], say: config_flags.Say
+def with_parts(
+    config: TrainConfig,
+    parts: Sequence[MeshPart],
+    made: Path,
+    *,
+    ior: Sequence[str],
+    say: config_flags.Say,
 ) -> TrainConfig:
     """Returns a configuration that uses a reconstructed object.
 
     Args:
       config: configuration, with the folder of the scene.
-      part: reconstructed object.
+      parts: parts of the reconstructed object.
       made: folder of its reconstruction.
       ior: values of --ior.
       say: called with the decisions that are made again.
     """
-    folder, index = str(made.resolve()), ((part.name, part.index),)
+    folder = str(made.resolve())
+    index = tuple((part.name, part.index) for part in parts)
     given = config.scene.reconstruction
     if given and Path(given).resolve() == made.resolve():
         config = config.decided(reconstruction=folder)
@@ -204,13 +213,13 @@ def with_part(
     return config.override(ior=index) if is_given else config.decided(ior=index)
 
 
-def note(run: Path, part: MeshPart | None, given: str) -> None:
+def note(run: Path, parts: Sequence[MeshPart] | None, given: str) -> None:
     """Records the origin of the object in the run's folder."""
     from experiments.r3f import object_source
 
     made = None
-    if part is not None:
-        made = object_source.Provenance(str(folder(run, given).resolve()), part.index)
+    if parts is not None:
+        made = object_source.Provenance(str(folder(run, given).resolve()), parts[0].index)
     object_source.write(run, made)
 
 
