@@ -170,8 +170,9 @@ class Revolution:
 
     The unknowns are two angles that tilt the axis, the shift of its point along the two directions
     across it, and the offset of the profile along its normals at knots. Between knots, the offset
-    is a cubic spline, even about the poles; a pole stays on the axis. Normals are those of the
-    spline through the offset points. The body is smooth: a crease of the mesh is rounded.
+    is a cubic spline, even about the poles; a pole stays on the axis. The profile of the fit is a
+    spline of the same knots, so that offsets can undo its waves. Normals are those of the spline
+    through the offset points. The body is smooth: a crease of the mesh is rounded.
 
     Attributes:
       name: kind of the shape.
@@ -188,7 +189,7 @@ class Revolution:
         self.axis, self.closed, self._size = axis, profile.closed, size
         at, length = _places(profile, _ALONG_PROFILE)
         knots, _ = _places(profile, _KNOTS)
-        self.points = _spline(*_even_length(profile), profile.closed)(at)
+        self.points = _between_knots(profile, knots)(at)
         self._along = _slope_matrices(at, length, profile.closed)
         along = np.stack([m @ self.points[:, i] for i, m in enumerate(self._along)], axis=-1)
         self.directions = _turn_right(along) / np.linalg.norm(along, axis=-1, keepdims=True)
@@ -274,13 +275,24 @@ def _places(profile: Profile, count: int) -> tuple[Float[np.ndarray, " count"], 
     return at[:count], float(length[-1])
 
 
-def _spline(at: Float[np.ndarray, " n"], points: Curve, closed: bool) -> Callable[..., Curve]:
-    """Returns the spline through a profile: radii odd about the poles, heights even."""
-    if closed:
-        return CubicSpline(at, points, bc_type="periodic")
-    radii = CubicSpline(at, points[:, 0], bc_type="natural")
-    heights = CubicSpline(at, points[:, 1], bc_type="clamped")
-    return lambda s: np.stack([radii(s), heights(s)], axis=-1)
+def _between_knots(profile: Profile, knots: Float[np.ndarray, " knots"]) -> Callable[..., Curve]:
+    """Returns the spline of given knots nearest to a profile: radii odd about the poles.
+
+    Shorter waves are noise, which no offset at the knots could remove.
+    """
+    length, points = _even_length(profile)
+    one = np.eye(len(knots))
+    if profile.closed:
+        cubics = [_even_spline(knots, float(length[-1]), True)] * 2
+    else:
+        # The radius is zero at both poles.
+        radii = CubicSpline(knots, one[:, 1:-1], bc_type="natural")
+        cubics = [radii, CubicSpline(knots, one, bc_type="clamped")]
+    values = [
+        np.linalg.lstsq(cubic(length), points[:, i], rcond=None)[0]
+        for i, cubic in enumerate(cubics)
+    ]
+    return lambda s: np.stack([c(s) @ v for c, v in zip(cubics, values, strict=True)], axis=-1)
 
 
 def _slope_matrices(

@@ -91,11 +91,12 @@ def fit_turned(
     shape = StraightTurned(smooth.axis, corners.points, fillets, size, closed=smooth.profile.closed)
     while bevels := [one for length, one in _simpler(shape, size) if length < _BEVEL * size]:
         shape = bevels[0]
-    shape, error = _simplified(*_adjusted(shape, cloud, size), cloud, size)
-    allowed = max(_WORSE * smooth.rms, smooth.rms + _MORE * size)
-    if error > min(furthest * size, allowed):
-        return None
-    return shape if shape.straight_share(shape.start()) >= _STRAIGHT_SHARE else None
+    allowed = min(furthest * size, max(_WORSE * smooth.rms, smooth.rms + _MORE * size))
+    shape, error = _adjusted(shape, cloud, size)
+    if error <= allowed:
+        shape, error = _simplified(shape, error, cloud, size)
+    near = error <= allowed and shape.straight_share(shape.start()) >= _STRAIGHT_SHARE
+    return shape if near else None
 
 
 def _some_of(cloud: Cloud) -> Cloud:

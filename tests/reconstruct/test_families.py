@@ -9,13 +9,22 @@ from trimesh.creation import torus as trimesh_torus
 from refref_jax.geometry.triangle_meshes import diameter, face_normals, make_mesh, volume
 from refref_jax.reconstruct import ReconstructionError
 from refref_jax.reconstruct.families import (
+    Revolution,
     candidates,
     fit_revolution,
     fit_sphere,
     fit_torus,
 )
 from refref_jax.reconstruct.polyhedra import fit_polyhedron
-from refref_jax.reconstruct.revolution import find_axis, lathe, outline, section, sweep
+from refref_jax.reconstruct.revolution import (
+    Axis,
+    Profile,
+    find_axis,
+    lathe,
+    outline,
+    section,
+    sweep,
+)
 from refref_jax.reconstruct.shapes import cloud_of, frame_along, mesh_of
 from tests.factories import bodies, revolved
 from tests.laws import posed_surfaces
@@ -186,6 +195,19 @@ def test_an_even_offset_moves_the_profile_along_its_normals(vase):
     # The poles stay on the axis, and the normals there along it.
     assert np.allclose(grown.points[[0, -1], 0], 0.0, atol=1e-12)
     assert np.allclose(grown.normals[[0, -1]], [[0.0, -1.0], [0.0, 1.0]], atol=1e-12)
+
+
+def test_waves_between_knots_are_smoothed():
+    """A ball whose profile has waves of a third of the distance between knots."""
+    angle = np.linspace(0.0, np.pi, 801)
+    radius = 1.0 + 0.003 * np.cos(100.0 * angle)
+    points = np.stack([radius * np.sin(angle), -radius * np.cos(angle)], axis=-1)
+    points[[0, -1], 0] = 0.0
+    shape = Revolution(Axis(np.zeros(3), np.eye(3)), Profile(points, False), 2.0)
+    away = np.linalg.norm(shape.points, axis=-1) - 1.0
+    # The ends of a spline follow the last wave.
+    assert np.abs(away[4:-4]).max() < 0.001
+    assert np.sqrt(np.mean(away**2)) < 0.0005
 
 
 def test_the_fit_is_equivariant():
