@@ -180,8 +180,16 @@ def errors_of(
     candidate: Candidate, surface: Backdrop, pixels: Photographs
 ) -> Float[np.ndarray, " rays"]:
     """Returns the robust error of each pixel in sRGB: root mean square of channels, capped."""
-    predicted = photometry.predict(body_of(candidate), surface, pixels.rays)
-    errors = np.sqrt(np.mean(photometry.residuals(predicted.linear, pixels.rgb) ** 2, axis=1))
+    return robust_errors(
+        photometry.predict(body_of(candidate), surface, pixels.rays), pixels.rgb
+    )
+
+
+def robust_errors(
+    predicted: photometry.Prediction, rgb: Float[np.ndarray, "rays 3"]
+) -> Float[np.ndarray, " rays"]:
+    """Returns the same of a prediction."""
+    errors = np.sqrt(np.mean(photometry.residuals(predicted.linear, rgb) ** 2, axis=1))
     return np.where(predicted.dropped < 1.0 - _FOLLOWED, np.minimum(errors, _CAP), _CAP)
 
 

@@ -37,8 +37,9 @@ Contents = Literal["none", "air", "liquid", "liquid and air"]
 # Knots of the offsets of the outer and of the inner wall.
 _KNOTS, _INNER_KNOTS = 36, 28
 
-# Standard deviations of the priors, as shares of the diameter: shift of the axis; offsets and second
-# differences of the outer wall, and of the inner wall; level; gap. Angles are in radians.
+# Standard deviations of the priors, as shares of the diameter: shift of the axis; offsets of the
+# outer wall and their second differences; the same of the inner wall; level; gap. Angles are in
+# radians.
 _ANGLE, _SHIFT = 0.02, 0.01
 _OFFSET, _BEND = 0.008, 0.004
 _INNER_OFFSET, _INNER_BEND = 0.03, 0.012
@@ -60,6 +61,9 @@ _INWARDS = 0.7
 # Offsets fade into their limits over this share of them.
 _FADE = 0.1
 
+# Number of interfaces of every vessel: those without faces let all share one compiled program.
+_PARTS = 3
+
 # Fewest points of a piece of the inner wall.
 _FEWEST = 20
 
@@ -80,6 +84,9 @@ class Detail(NamedTuple):
     inner: int = 176
     azimuths: int = 128
 
+
+FINE = Detail()
+"""Enough for photographs of 200 x 200 pixels."""
 
 COARSE = Detail(outer=72, inner=80, azimuths=64)
 """Enough for a look through a blurred backdrop."""
@@ -195,7 +202,7 @@ class Vessel:
       size: diameter, world units.
     """
 
-    def __init__(self, body: Revolution, interior: Interior, detail: Detail = Detail()) -> None:
+    def __init__(self, body: Revolution, interior: Interior, detail: Detail = FINE) -> None:
         """Takes the outer surface and what is inside.
 
         Raises:
@@ -307,6 +314,7 @@ class Vessel:
         parts = [self._posed(outline, x, zeros) for outline in self._pieces(x)]
         interior, layout = self.interior(x), self.layout
         kinds = self._kinds()
+        kinds += ["air"] * (_PARTS - len(kinds))
         index = {"glass": interior.glass, "liquid": interior.liquid, "air": 1.0}
         tint = {"glass": interior.glass_tint, "liquid": interior.tint, "air": (1.0, 1.0, 1.0)}
         by_indices, by_tints = np.zeros((len(kinds), len(x))), np.zeros((3 * len(kinds), len(x)))
