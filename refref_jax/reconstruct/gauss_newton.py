@@ -22,7 +22,7 @@ refracted light; the sparse Jacobian through traced triangles is ours.
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import scipy.linalg
@@ -35,7 +35,7 @@ from refref_jax.reconstruct import ReconstructionError, photometry
 from refref_jax.reconstruct.photometry import Backdrop, Body, Photographs
 from refref_jax.reconstruct.shapes import Posed
 
-Matrix = Float[np.ndarray, "rows unknowns"] | scipy.sparse.csr_array
+Matrix = Float[np.ndarray, "_ _"] | scipy.sparse.csr_array
 """A matrix of derivatives, dense or sparse."""
 
 # Errors of pixels beyond this, in sRGB, do not grow in the robust error.
@@ -71,6 +71,7 @@ class Candidate(NamedTuple):
     by_tints: Matrix
 
 
+@runtime_checkable
 class Model(Protocol):
     """What a vector of unknowns means."""
 
@@ -180,9 +181,7 @@ def errors_of(
     candidate: Candidate, surface: Backdrop, pixels: Photographs
 ) -> Float[np.ndarray, " rays"]:
     """Returns the robust error of each pixel in sRGB: root mean square of channels, capped."""
-    return robust_errors(
-        photometry.predict(body_of(candidate), surface, pixels.rays), pixels.rgb
-    )
+    return robust_errors(photometry.predict(body_of(candidate), surface, pixels.rays), pixels.rgb)
 
 
 def robust_errors(
@@ -262,11 +261,14 @@ def _step(
     matrix, gradient = light.matrix + precision, light.gradient + pull
     scales = model.scales()
     before = float(errors_of(candidate, surface, judges).mean())
+    error = lambda y: float(errors_of(model.pose(y), surface, judges).mean())  # noqa: E731
     for _ in range(3):
         damped = matrix + damping * np.diag(np.diag(light.matrix) + np.diag(precision))
         change = -scipy.linalg.solve(damped, gradient, assume_a="pos")
         change *= min(1.0, 1.0 / max(float(np.max(np.abs(change) / scales)), 1e-12))
-        after = float(errors_of(model.pose(x + change), surface, judges).mean())
+        after = error(x + change)
+        if after < before:
+            change, after = _further(x, change, after, scales, error)
         rms = float(np.sqrt(np.mean((change / scales) ** 2)))
         if after < before:
             return (
@@ -276,6 +278,22 @@ def _step(
             )
         damping = max(10.0 * damping, 1e-2)
     return x, damping, StepFacts(blur, before, after, damping, False, rms)
+
+
+def _further(
+    x: Float[np.ndarray, " unknowns"],
+    change: Float[np.ndarray, " unknowns"],
+    after: float,
+    scales: Float[np.ndarray, " unknowns"],
+    error: Callable[[Float[np.ndarray, " unknowns"]], float],
+) -> tuple[Float[np.ndarray, " unknowns"], float]:
+    """Doubles a step as long as that helps: far from the solution, slopes promise too little."""
+    while float(np.max(np.abs(change) / scales)) < 0.5:
+        tried = error(x + 2.0 * change)
+        if tried >= after:
+            break
+        change, after = 2.0 * change, tried
+    return change, after
 
 
 def _with_rows(light: _Equations, rows: Rows) -> _Equations:
@@ -315,13 +333,11 @@ def _linearise(
     return _Equations(dense / scale, weighted.T @ error.reshape(-1) / scale)
 
 
-def _by_unknowns(
-    candidate: Candidate, body: Body, found: photometry.Sensitivities
-) -> Matrix:
+def _by_unknowns(candidate: Candidate, body: Body, found: photometry.Sensitivities) -> Matrix:
     """Returns the derivatives of the coordinates of all rays by the unknowns, ray-major."""
     parts = candidate.parts
-    first = np.cumsum([0] + [len(part.vertices) for part in parts])
-    first_normal = np.cumsum([0] + [len(part.normals) for part in parts])
+    first = np.cumsum([0] + [len(part.vertices) for part in parts]).tolist()
+    first_normal = np.cumsum([0] + [len(part.normals) for part in parts]).tolist()
     vertices = np.concatenate([p.faces + n for p, n in zip(parts, first, strict=False)])
     normals = np.concatenate([p.normal_ids + n for p, n in zip(parts, first_normal, strict=False)])
     ray, bend = np.nonzero(found.primitives != NO_PRIMITIVE)
@@ -330,7 +346,9 @@ def _by_unknowns(
     total = _scattered(found.by_corners[ray, :, bend], ray, vertices[face], (count, first[-1]))
     by = _stacked([part.by_vertices for part in parts])
     total = total @ by
-    turned = _scattered(found.by_normals[ray, :, bend], ray, normals[face], (count, first_normal[-1]))
+    turned = _scattered(
+        found.by_normals[ray, :, bend], ray, normals[face], (count, first_normal[-1])
+    )
     total = total + turned @ _stacked([part.by_normals for part in parts])
     by_index = scipy.sparse.csr_array(found.by_indices.reshape(3 * count, -1).astype(np.float64))
     return total + by_index @ candidate.by_indices
@@ -359,7 +377,7 @@ def _stacked(matrices: Sequence[Matrix]) -> Matrix:
     return np.concatenate(matrices)
 
 
-def _block_diagonal(blocks: Float[np.ndarray, "rays 3 3"]) -> scipy.sparse.bsr_array:
+def _block_diagonal(blocks: Float[np.ndarray, "rays 3 3"]) -> scipy.sparse.csr_array:
     count = len(blocks)
     data = (blocks.astype(np.float64), np.arange(count), np.arange(count + 1))
     return scipy.sparse.bsr_array(data, shape=(3 * count, 3 * count)).tocsr()

@@ -49,8 +49,9 @@ _LEVEL, _GAP = 0.12, 0.04
 _GLASS, _LIQUID, _TINT = 0.03, 0.1, 1.0
 
 # Largest changes in a step: of level and gap, as a share of the diameter, of an index, and of the
-# logarithm of a tint.
+# logarithm of a tint. The inner wall, which no mask shows, moves further than the outer one.
 _LEVEL_STEP, _INDEX_STEP, _TINT_STEP = 0.015, 0.02, 0.3
+_INNER_STEPS = 2.0
 
 # Least thickness of a wall and of its gap, as a share of the diameter, and of the wall at rest.
 _THINNEST, _LEAST_GAP, _LEAST_SHARE = 0.002, 0.001, 0.25
@@ -80,9 +81,9 @@ class Detail(NamedTuple):
       azimuths: number of half-planes.
     """
 
-    outer: int = 160
-    inner: int = 176
-    azimuths: int = 128
+    outer: int = 112
+    inner: int = 124
+    azimuths: int = 96
 
 
 FINE = Detail()
@@ -437,13 +438,10 @@ class Vessel:
         """
         now, candidate = self.interior(x), self.pose(x)
         tints = {"glass": now.glass_tint, "liquid": now.tint, "air": (1.0, 1.0, 1.0)}
+        indices = {"glass": now.glass, "liquid": now.liquid, "air": 1.0}
         return [
-            Solid(
-                name, mesh_of(part), float(index), NO_PARENT if name == "glass" else 0, tints[name]
-            )
-            for name, part, index in zip(
-                self._kinds(), candidate.parts, candidate.interfaces.index_inside, strict=True
-            )
+            Solid(name, mesh_of(part), indices[name], 0 if number else NO_PARENT, tints[name])
+            for number, (name, part) in enumerate(zip(self._kinds(), candidate.parts, strict=True))
         ]
 
     def prior(
@@ -478,6 +476,7 @@ class Vessel:
         layout, size = self.layout, self.size
         found = np.full(layout.count, LARGEST_STEP * size)
         found[:2] = LARGEST_TURN
+        found[layout.inner] *= _INNER_STEPS
         found[layout.level] = found[layout.gap] = _LEVEL_STEP * size
         found[layout.glass] = found[layout.liquid] = _INDEX_STEP
         found[layout.tint] = found[layout.glass_tint] = _TINT_STEP

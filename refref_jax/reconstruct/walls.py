@@ -187,6 +187,10 @@ class Wall:
         return at, (by_height - by_value[0]) / max(slope, _FLAT)
 
 
+Point = tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2 m"]]
+"""A point of the half-plane and its derivatives."""
+
+
 class Stretch(NamedTuple):
     """Part of a profile without creases.
 
@@ -201,11 +205,11 @@ class Stretch(NamedTuple):
         points, by_points, normals, by_normals = (each[::-1] for each in self.turned)
         return Stretch(Turned(points, by_points, -normals, -by_normals))
 
-    def first(self) -> tuple[Curve, np.ndarray]:
+    def first(self) -> Point:
         """Returns the first point and its derivatives."""
         return self.turned.points[0], self.turned.by_points[0]
 
-    def last(self) -> tuple[Curve, np.ndarray]:
+    def last(self) -> Point:
         """Returns the last point and its derivatives."""
         return self.turned.points[-1], self.turned.by_points[-1]
 
@@ -258,7 +262,7 @@ def shares(
 
 
 def disc(
-    rim: tuple[Curve, np.ndarray], height: float, by_height: Float[np.ndarray, " m"]
+    rim: Point, height: float, by_height: Float[np.ndarray, " m"]
 ) -> Stretch:
     """Returns a horizontal surface that faces up, from the rim to the axis.
 
@@ -375,7 +379,7 @@ def inset(profile: Profile, distance: float, size: float) -> Profile | None:
     return Profile(points, closed=False)
 
 
-def _even(points: Curve, count: int) -> Curve:
+def _even(points: Curve, count: int) -> Float[np.ndarray, "count 2"]:
     """Returns a curve in even steps."""
     length = _lengths(points)
     ticks = np.linspace(0.0, length[-1], count)
