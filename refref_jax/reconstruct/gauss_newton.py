@@ -22,7 +22,7 @@ refracted light; the sparse Jacobian through traced triangles is ours.
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 import scipy.linalg
@@ -35,7 +35,7 @@ from refref_jax.reconstruct import ReconstructionError, photometry
 from refref_jax.reconstruct.photometry import Backdrop, Body, Photographs
 from refref_jax.reconstruct.shapes import Posed
 
-Matrix = Float[np.ndarray, "_ _"] | scipy.sparse.csr_array
+Matrix: TypeAlias = Float[np.ndarray, "_ _"] | scipy.sparse.csr_array
 """A matrix of derivatives, dense or sparse."""
 
 # Errors of pixels beyond this, in sRGB, do not grow in the robust error.

@@ -170,15 +170,14 @@ def search(
     looks = looks_at_all(body, surface, pixels, settings)
     say(f"{len(looks)} looks; best: {looks[0].interior.name}, error {looks[0].error:.4f}")
     rough = []
-    for each in finalists(looks, settings):
-        finding = _few_fitted(body, each.interior, surface, pixels, judges, settings)
-        say(f"{each.interior.name}: looked {each.error:.4f}, error {finding.error:.4f}")
+    for found in finalists(looks, settings):
+        finding = _few_fitted(body, found.interior, surface, pixels, judges, settings)
+        say(f"{found.interior.name}: looked {found.error:.4f}, error {finding.error:.4f}")
         rough.append(finding)
-    rough = _best_of_kinds(rough, settings)
     findings = []
-    for each in rough:
+    for each in _best_of_kinds(rough, settings):
         vessel = Vessel(body, _with_gap(body, each, surface, pixels, settings), detail)
-        finding = _fitted(vessel, vessel.start(), surface, pixels, judges, settings, outlines)
+        finding = _fitted(vessel, surface, pixels, judges, settings, outlines)
         say(f"{each.vessel.interior_at_start.name}: all unknowns, error {finding.error:.4f}")
         findings.append(finding)
     return Found(select(findings, surface, judges), findings, looks)
@@ -208,7 +207,6 @@ def _few_fitted(
 
 def _fitted(
     vessel: Vessel,
-    x: Float[np.ndarray, " unknowns"],
     surface: Backdrop,
     pixels: Photographs,
     judges: Photographs,
@@ -217,6 +215,7 @@ def _fitted(
 ) -> Finding:
     """Returns a hypothesis after steps of all unknowns."""
     steps = Steps(settings.all, settings.last_rays, settings.rays, _OUTLIERS, seed=settings.seed)
+    x = vessel.start()
     fit = gauss_newton.fit(vessel, x, surface, pixels, settings=steps, outlines=outlines)
     return _finding(vessel, fit.x, fit.covariance, surface, judges)
 

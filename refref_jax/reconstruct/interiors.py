@@ -31,6 +31,9 @@ from refref_jax.reconstruct.revolution import Curve, Profile, lathe
 from refref_jax.reconstruct.shapes import LARGEST_STEP, LARGEST_TURN, Posed, mesh_of
 from refref_jax.reconstruct.walls import Limits, Moved, Outline, Stretch, Wall
 
+Colour = tuple[float, float, float]
+"""Linear RGB."""
+
 Contents = Literal["none", "air", "liquid", "liquid and air"]
 """What is inside the glass; `none` is solid glass."""
 
@@ -117,8 +120,8 @@ class Interior:
     gap: float = 0.01
     glass: float = 1.5
     liquid: float = 1.36
-    tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    glass_tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    tint: Colour = (1.0, 1.0, 1.0)
+    glass_tint: Colour = (1.0, 1.0, 1.0)
     stained: bool = False
 
     @property
@@ -137,7 +140,8 @@ class Interior:
         return self.contents == "liquid and air"
 
 
-class Solid(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Solid:
     """A part of a scene.
 
     Attributes:
@@ -152,7 +156,7 @@ class Solid(NamedTuple):
     mesh: Mesh
     index: float
     parent: int
-    tint: tuple[float, float, float]
+    tint: Colour
 
 
 class Layout:
@@ -273,8 +277,8 @@ class Vessel:
         inner = self._inner
         count, cut = len(inner.at), inner.length
         if interior.level_unknown:
-            rest = Moved(inner.points, np.zeros((count, 2, 0)))
-            cut, _ = inner.reach(rest, float(np.clip(interior.level, *self._range)), np.zeros(0))
+            still = Moved(inner.points, np.zeros((count, 2, 0)))
+            cut, _ = inner.reach(still, float(np.clip(interior.level, *self._range)), np.zeros(0))
             # The number of points below depends on the level at rest; that of all does not.
             count = int(np.clip(np.searchsorted(inner.at, cut), _FEWEST, count - _FEWEST))
         found.append(walls.shares(inner.at, 0.0, cut, count))
@@ -295,19 +299,31 @@ class Vessel:
 
     def interior(self, x: Float[np.ndarray, " unknowns"]) -> Interior:
         """Returns what is inside at given unknowns; the wall is the mean one."""
-        layout, found = self.layout, {}
-        for name in ("level", "gap", "glass", "liquid"):
+        layout, rest = self.layout, self.interior_at_start
+        numbers = {"level": rest.level, "gap": rest.gap, "glass": rest.glass, "liquid": rest.liquid}
+        for name in numbers:
             values = x[getattr(layout, name)]
             if len(values):
-                found[name] = float(values[0])
-        for name in ("tint", "glass_tint"):
-            values = x[getattr(layout, name)]
-            if len(values):
-                found[name] = tuple(float(value) for value in np.exp(values))
-        if self.interior_at_start.level_unknown:
-            level = float(np.clip(found["level"], *self._range))
-            found.update(level=level, gap=max(found["gap"], _LEAST_GAP * self.size))
-        return dataclasses.replace(self.interior_at_start, **found)
+                numbers[name] = float(values[0])
+        if rest.level_unknown:
+            numbers["level"] = float(np.clip(numbers["level"], *self._range))
+            numbers["gap"] = max(numbers["gap"], _LEAST_GAP * self.size)
+
+        def tint(where: slice, otherwise: Colour) -> Colour:
+            if where.stop == where.start:
+                return otherwise
+            red, green, blue = np.exp(x[where])
+            return float(red), float(green), float(blue)
+
+        return dataclasses.replace(
+            rest,
+            level=numbers["level"],
+            gap=numbers["gap"],
+            glass=numbers["glass"],
+            liquid=numbers["liquid"],
+            tint=tint(layout.tint, rest.tint),
+            glass_tint=tint(layout.glass_tint, rest.glass_tint),
+        )
 
     def pose(self, x: Float[np.ndarray, " unknowns"]) -> Candidate:
         """Returns the vessel at given unknowns."""
@@ -375,8 +391,8 @@ class Vessel:
             inside = self._cut(inner, levels, still)
             bottom = self._inner.reach(inner, *levels[1])
         else:
-            inside = [walls.between(self._inner, inner, self._plan[1], (0.0, still), (None, still))]
-            inside, bottom = [walls.joined(inside)], (0.0, still)
+            full = walls.between(self._inner, inner, self._plan[1], (0.0, still), (None, still))
+            inside, bottom = [walls.joined([full])], (0.0, still)
         if not interior.mouth:
             return [walls.joined([whole]), *inside]
         glass = self._open(outer, inner, bottom, still)

@@ -256,14 +256,13 @@ def shares(
     at: Float[np.ndarray, " n"], begin: float, end: float, count: int
 ) -> Float[np.ndarray, " count"]:
     """Returns points from 0 to 1, as dense as those of a wall between two lengths."""
-    number = np.interp([begin, end], at, np.arange(len(at)))
-    found = np.interp(np.linspace(*number, count), np.arange(len(at)), at)
+    steps = np.arange(len(at))
+    first, last = (float(np.interp(each, at, steps)) for each in (begin, end))
+    found: np.ndarray = np.interp(np.linspace(first, last, count), steps, at)
     return (found - begin) / max(end - begin, 1e-12)
 
 
-def disc(
-    rim: Point, height: float, by_height: Float[np.ndarray, " m"]
-) -> Stretch:
+def disc(rim: Point, height: float, by_height: Float[np.ndarray, " m"]) -> Stretch:
     """Returns a horizontal surface that faces up, from the rim to the axis.
 
     Args:
