@@ -6,6 +6,8 @@ on the masks (`occupancy`, as in the paper) yields the same kind of grid. `mesh_
 the mesh with a ground-truth mesh and with the masks; `refractive_index` estimates the index from
 images. `families` finds balls, tori, surfaces of revolution (`revolution`) and convex polyhedra
 (`polyhedra`) in noisy meshes, as surfaces whose few unknowns light can determine (`shapes`).
+`interiors` has vessels with liquid and air inside, whose walls are profiles (`walls`);
+`interior_search` finds out what is inside, from looks at many hypotheses (`interior_looks`).
 """
 
 

@@ -25,7 +25,7 @@ refracted light; the sparse Jacobian through traced triangles is ours.
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 import scipy.linalg
@@ -38,7 +38,7 @@ from refref_jax.reconstruct import ReconstructionError, photometry
 from refref_jax.reconstruct.photometry import Backdrop, Body, Photographs
 from refref_jax.reconstruct.shapes import Posed
 
-Matrix = Float[np.ndarray, "rows unknowns"] | scipy.sparse.csr_array
+Matrix: TypeAlias = Float[np.ndarray, "_ _"] | scipy.sparse.csr_array
 """A matrix of derivatives, dense or sparse."""
 
 # Errors of pixels beyond this, in sRGB, do not grow in the robust error.
@@ -195,8 +195,14 @@ def body_of(candidate: Candidate) -> Body:
 
 def errors_of(body: Body, surface: Backdrop, pixels: Photographs) -> Float[np.ndarray, " rays"]:
     """Returns the robust error of each pixel in sRGB: root mean square of channels, capped."""
-    predicted = photometry.predict(body, surface, pixels.rays)
-    errors = np.sqrt(np.mean(photometry.residuals(predicted.linear, pixels.rgb) ** 2, axis=1))
+    return robust_errors(photometry.predict(body, surface, pixels.rays), pixels.rgb)
+
+
+def robust_errors(
+    predicted: photometry.Prediction, rgb: Float[np.ndarray, "rays 3"]
+) -> Float[np.ndarray, " rays"]:
+    """Returns the same of a prediction."""
+    errors = np.sqrt(np.mean(photometry.residuals(predicted.linear, rgb) ** 2, axis=1))
     return np.where(predicted.dropped < 1.0 - _FOLLOWED, np.minimum(errors, _CAP), _CAP)
 
 
@@ -267,11 +273,14 @@ def _step(
     matrix, gradient = light.matrix + precision, light.gradient + pull
     scales = model.scales()
     before = float(errors_of(body, surface, judges).mean())
+    error = lambda y: float(errors_of(body_of(model.pose(y)), surface, judges).mean())  # noqa: E731
     for _ in range(3):
         damped = matrix + damping * np.diag(np.diag(light.matrix) + np.diag(precision))
         change = -scipy.linalg.solve(damped, gradient, assume_a="pos")
         change *= min(1.0, 1.0 / max(float(np.max(np.abs(change) / scales)), 1e-12))
-        after = float(errors_of(body_of(model.pose(x + change)), surface, judges).mean())
+        after = error(x + change)
+        if after < before:
+            change, after = _further(x, change, after, scales, error)
         rms = float(np.sqrt(np.mean((change / scales) ** 2)))
         if after < before:
             return (
@@ -281,6 +290,22 @@ def _step(
             )
         damping = max(10.0 * damping, 1e-2)
     return x, damping, StepFacts(blur, before, after, damping, False, rms)
+
+
+def _further(
+    x: Float[np.ndarray, " unknowns"],
+    change: Float[np.ndarray, " unknowns"],
+    after: float,
+    scales: Float[np.ndarray, " unknowns"],
+    error: Callable[[Float[np.ndarray, " unknowns"]], float],
+) -> tuple[Float[np.ndarray, " unknowns"], float]:
+    """Doubles a step as long as that helps: far from the solution, slopes promise too little."""
+    while float(np.max(np.abs(change) / scales)) < 0.5:
+        tried = error(x + 2.0 * change)
+        if tried >= after:
+            break
+        change, after = 2.0 * change, tried
+    return change, after
 
 
 def _with_rows(light: Equations, rows: Rows) -> Equations:
@@ -351,8 +376,8 @@ def _covariance(
 def _by_unknowns(candidate: Candidate, body: Body, found: photometry.Sensitivities) -> Matrix:
     """Returns the derivatives of the coordinates of all rays by the unknowns, ray-major."""
     parts = candidate.parts
-    first = np.cumsum([0] + [len(part.vertices) for part in parts])
-    first_normal = np.cumsum([0] + [len(part.normals) for part in parts])
+    first = np.cumsum([0] + [len(part.vertices) for part in parts]).tolist()
+    first_normal = np.cumsum([0] + [len(part.normals) for part in parts]).tolist()
     vertices = np.concatenate([p.faces + n for p, n in zip(parts, first, strict=False)])
     normals = np.concatenate([p.normal_ids + n for p, n in zip(parts, first_normal, strict=False)])
     ray, bend = np.nonzero(found.primitives != NO_PRIMITIVE)
@@ -392,7 +417,7 @@ def _stacked(matrices: Sequence[Matrix]) -> Matrix:
     return np.concatenate(matrices)
 
 
-def _block_diagonal(blocks: Float[np.ndarray, "rays 3 3"]) -> scipy.sparse.bsr_array:
+def _block_diagonal(blocks: Float[np.ndarray, "rays 3 3"]) -> scipy.sparse.csr_array:
     count = len(blocks)
     data = (blocks.astype(np.float64), np.arange(count), np.arange(count + 1))
     return scipy.sparse.bsr_array(data, shape=(3 * count, 3 * count)).tocsr()

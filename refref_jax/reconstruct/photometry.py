@@ -288,7 +288,7 @@ def _differentiate(
     slopes = _slopes(mips, lookups) * ends.throughput[:, None]
     radiance = backdrop.radiance(mips, lookups)
     met = primitives[:, :-1] != NO_PRIMITIVE
-    kinds = jnp.arange(indices.shape[0], dtype=jnp.int32)
+    kinds = jnp.arange(indices.shape[0], dtype=jnp.int32)[None, None]
     crossings = jnp.sum((parts[:, :-1, None] == kinds) & met[..., None], axis=1, dtype=jnp.int32)
     cut = lambda x: x[:, :, :-1]  # noqa: E731 - the last cast meets nothing
     found = Sensitivities(
@@ -349,7 +349,7 @@ def _slopes(mips: Mips, lookups: Lookups) -> Float[Array, "rays 2 3"]:
     sides = lookups.sides.astype(lookups.starts.dtype)
 
     def along(axis: int) -> Float[Array, "rays 3"]:
-        shift = _HALF_WIDTH * jnp.eye(2, dtype=lookups.starts.dtype)[axis]
+        shift = _HALF_WIDTH * jnp.eye(2, dtype=lookups.starts.dtype)[axis][None]
         there, here = (
             backdrop.radiance(mips, lookups._replace(starts=lookups.starts + sign * shift))
             for sign in (1.0, -1.0)

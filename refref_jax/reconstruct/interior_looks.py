@@ -1,0 +1,238 @@
+"""Looks at hypotheses of what is inside a vessel, through a blurred backdrop.
+
+A look predicts a thousand pixels. Tints come first, because they remove most of the error, and are
+found without tracing light again. Hypotheses start from the thickness of the wall, what is inside
+and the level; other gaps, liquids and an open mouth are tried for the best of them.
+
+Source: ours.
+"""
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+
+from refref_jax.reconstruct import ReconstructionError, gauss_newton, photometry
+from refref_jax.reconstruct.families import Revolution
+from refref_jax.reconstruct.interiors import COARSE, Contents, Detail, Interior, Vessel
+from refref_jax.reconstruct.photometry import Backdrop, Photographs
+
+# Errors of a channel beyond this, in sRGB, do not grow while a tint is found.
+_CAP = 0.15
+
+# Logarithms of the tints tried, and the one that counts the crossings.
+_LOG_TINTS = np.linspace(0.05, -2.5, 103)
+_COUNTING = np.log(0.5)
+
+
+@dataclasses.dataclass(frozen=True)
+class SearchSettings:
+    """Settings of a search.
+
+    Attributes:
+      walls: thicknesses of the wall, as shares of the diameter.
+      levels: number of heights of the liquid's surface.
+      gaps: heights of the glass between liquid and air, as shares of the diameter.
+      indices: indices of refraction of the liquid.
+      mouths: whether vessels may be closed, open, or both.
+      stained: whether the glass may have a tint.
+      blur: halvings of the backdrop's resolution in looks.
+      pixels: number of pixels of a look.
+      finalists: number of hypotheses of each kind that are improved.
+      few: blurs of the steps of the few numbers of a hypothesis.
+      all: blurs of the steps of all unknowns.
+      rays: number of pixels of a step of the few numbers.
+      last_rays: number of pixels of a step of all unknowns.
+      rivals: hypotheses whose error is above that of the best by more than this factor are left
+        out before all unknowns are fitted.
+      seed: seed of the draws.
+    """
+
+    walls: tuple[float, ...] = (0.025, 0.05, 0.1, 0.15)
+    levels: int = 10
+    gaps: tuple[float, ...] = (0.004, 0.04)
+    indices: tuple[float, ...] = (1.36, 1.333, 1.47)
+    mouths: tuple[bool, ...] = (False, True)
+    stained: bool = False
+    blur: int = 3
+    pixels: int = 1500
+    finalists: int = 2
+    few: tuple[int, ...] = (3, 3, 3, 2, 2, 2, 1, 1, 1)
+    all: tuple[int, ...] = (2, 2, 1, 1, 0, 0, 0, 0, 0, 0, 0, 0)
+    rays: int = 8192
+    last_rays: int = 16384
+    rivals: float = 1.25
+    seed: int = 0
+
+
+class Look(NamedTuple):
+    """A hypothesis and its error.
+
+    Attributes:
+      interior: the hypothesis, with the tint that suits it best.
+      error: mean robust error of the pixels in sRGB.
+    """
+
+    interior: Interior
+    error: float
+
+
+def hypotheses(body: Revolution, settings: SearchSettings = SearchSettings()) -> list[Interior]:
+    """Returns what may be inside a body, the simplest first.
+
+    Indices other than the first, and open vessels, are tried later, for the best of these.
+    """
+    size, low = extent(body)
+    kinds: tuple[Contents, ...] = ("none", "air", "liquid", "liquid and air")
+    found = []
+    for contents in kinds:
+        for wall in settings.walls if contents != "none" else settings.walls[:1]:
+            at = Interior(
+                contents,
+                wall=wall * size,
+                gap=settings.gaps[-1] * size,
+                liquid=settings.indices[0],
+                stained=settings.stained,
+            )
+            if not at.level_unknown:
+                found.append(at)
+                continue
+            inside = (1.0 - 2.0 * wall) * size
+            steps = (np.arange(settings.levels) + 0.5) / settings.levels
+            levels = low + wall * size + inside * steps
+            found += [dataclasses.replace(at, level=float(level)) for level in levels]
+    return found
+
+
+def extent(body: Revolution) -> tuple[float, float]:
+    """Returns the height of a body and its lower end."""
+    heights = body.points[:, 1]
+    return float(heights.max() - heights.min()), float(heights.min())
+
+
+def look(
+    body: Revolution,
+    interior: Interior,
+    surface: Backdrop,
+    pixels: Photographs,
+    detail: Detail = COARSE,
+) -> Look:
+    """Predicts some pixels for a hypothesis, with the tint that suits it best.
+
+    Light that crosses tinted surfaces n times fades with the nth power of the tint. Prediction with
+    another tint gives n, a mean over the light of the pixel, and the tint follows without tracing.
+
+    Raises:
+      ReconstructionError: if the wall leaves no space inside.
+    """
+    solid = interior.contents == "none"
+    # Solid glass is looked at as if it had an inside of glass: one compiled program serves all.
+    seen = dataclasses.replace(interior, contents="liquid", liquid=interior.glass)
+    vessel = Vessel(body, seen if solid else interior, detail)
+    x, layout = vessel.start(), vessel.layout
+    where = layout.tint if interior.filled else layout.glass_tint
+    scene = gauss_newton.body_of(vessel.pose(x))
+    clear = photometry.predict(scene, surface, pixels.rays)
+    linear = clear.linear
+    if where.stop > where.start:
+        darker = x.copy()
+        darker[where] += _COUNTING
+        interfaces = jax.device_put(vessel.pose(darker).interfaces)
+        scene = scene._replace(scene=scene.scene._replace(interfaces=interfaces))
+        dark = photometry.predict(scene, surface, pixels.rays)
+        crossings = np.log(np.maximum(dark.linear, 1e-9) / np.maximum(linear, 1e-9)) / _COUNTING
+        change = _best_tint(linear, np.maximum(crossings, 0.0), pixels.rgb)
+        x[where] += change
+        linear = linear * np.exp(change * crossings)
+    found = vessel.interior(x)
+    if solid:
+        found = dataclasses.replace(found, contents="none", liquid=interior.liquid)
+    return Look(
+        found, float(gauss_newton.robust_errors(clear._replace(linear=linear), pixels.rgb).mean())
+    )
+
+
+def _best_tint(
+    linear: Float[np.ndarray, "rays 3"],
+    crossings: Float[np.ndarray, "rays 3"],
+    rgb: Float[np.ndarray, "rays 3"],
+) -> Float[np.ndarray, "3"]:
+    """Returns the logarithm of the tint of least robust error, by channel."""
+    errors = [
+        np.minimum(np.abs(photometry.residuals(linear * np.exp(t * crossings), rgb)), _CAP).mean(0)
+        for t in _LOG_TINTS
+    ]
+    return _LOG_TINTS[np.argmin(np.stack(errors), axis=0)]
+
+
+def looks_at_all(
+    body: Revolution, surface: Backdrop, pixels: Photographs, settings: SearchSettings
+) -> list[Look]:
+    """Returns the looks at all hypotheses, the best first."""
+    generator = np.random.default_rng(settings.seed)
+    some = pixels.chosen(draw(generator, len(pixels.views), settings.pixels))
+    blurred = photometry.blurred(surface, settings.blur)
+
+    def tried(interiors: Iterator[Interior] | Sequence[Interior]) -> list[Look]:
+        found = []
+        for interior in interiors:
+            try:
+                found.append(look(body, interior, blurred, some))
+            except ReconstructionError:
+                continue
+        return found
+
+    looks = tried(hypotheses(body, settings))
+    for variants in (_other_gaps, _other_indices, _other_mouths):
+        best = _best_looks(looks, settings)
+        looks += tried(other for each in best for other in variants(each.interior, body, settings))
+    return sorted(looks, key=lambda each: each.error)
+
+
+def finalists(looks: Sequence[Look], settings: SearchSettings) -> list[Look]:
+    """Returns the best looks of each kind, without those that are far worse than the best."""
+    best = min(each.error for each in looks)
+    return [each for each in _best_looks(looks, settings) if each.error < settings.rivals * best]
+
+
+def draw(generator: np.random.Generator, every: int, count: int) -> Int[np.ndarray, " count"]:
+    """Draws some of all pixels without repetition."""
+    return generator.choice(every, min(count, every), replace=False)
+
+
+def _other_gaps(at: Interior, body: Revolution, settings: SearchSettings) -> list[Interior]:
+    """Returns the same with other gaps, whose middle stays where it is."""
+    size = extent(body)[0]
+    if not at.level_unknown:
+        return []
+    gaps = [gap * size for gap in settings.gaps]
+    return [
+        dataclasses.replace(at, gap=gap, level=at.level + 0.5 * (at.gap - gap))
+        for gap in gaps
+        if gap != at.gap
+    ]
+
+
+def _other_indices(at: Interior, body: Revolution, settings: SearchSettings) -> list[Interior]:
+    """Returns the same with other liquids."""
+    del body
+    others = [index for index in settings.indices if index != at.liquid]
+    return [dataclasses.replace(at, liquid=index) for index in others if at.filled]
+
+
+def _other_mouths(at: Interior, body: Revolution, settings: SearchSettings) -> list[Interior]:
+    """Returns the same with an open mouth."""
+    del body
+    fits = at.contents in ("air", "liquid and air") and True in settings.mouths
+    return [dataclasses.replace(at, mouth=True)] if fits else []
+
+
+def _best_looks(looks: Sequence[Look], settings: SearchSettings) -> list[Look]:
+    """Returns the best looks of each kind."""
+    names = sorted({each.interior.name for each in looks})
+    ordered = sorted(looks, key=lambda each: each.error)
+    kinds = [[each for each in ordered if each.interior.name == name] for name in names]
+    return [each for kind in kinds for each in kind[: settings.finalists]]

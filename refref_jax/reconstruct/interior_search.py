@@ -1,0 +1,302 @@
+"""Finds out what is inside a vessel of revolution, from photographs of light refracted by it.
+
+Descent can not turn solid glass into a bottle of water: what is seen through it moves by tens of
+degrees. So `search` looks at many hypotheses through a blurred backdrop, where a rough one is
+already better than none; tints come first, because they remove most of the error, and are found
+without tracing light again. The best hypotheses of each kind are improved by Gauss-Newton steps,
+first of their few numbers, then of all unknowns. The simplest one that explains held-out pixels not
+significantly worse than the best is kept.
+
+The outer surface must come from masks: fitting it to light first would dent it.
+
+Source: ours.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse
+from jaxtyping import Float
+
+from refref_jax.reconstruct import ReconstructionError, gauss_newton, photometry
+from refref_jax.reconstruct.families import Revolution
+from refref_jax.reconstruct.gauss_newton import Candidate, Matrix, Model, Rows, Steps
+from refref_jax.reconstruct.interior_looks import (
+    Look,
+    SearchSettings,
+    draw,
+    extent,
+    finalists,
+    look,
+    looks_at_all,
+)
+from refref_jax.reconstruct.interiors import COARSE, FINE, Detail, Interior, Vessel
+from refref_jax.reconstruct.photometry import Backdrop, Photographs
+
+# Errors above this multiple of what the backdrop leaves unexplained are those of a wrong interior.
+_UNEXPLAINED = 2.5
+
+# Share of the pixels of largest derivatives that a step leaves out: interiors have many surfaces.
+_OUTLIERS = 0.02
+
+# Gaps tried once the level is known, as shares of the diameter, and the blur of these looks.
+_GAPS, _GAP_BLUR = (0.001, 0.004, 0.01, 0.02, 0.03, 0.045, 0.06, 0.08, 0.1), 2
+
+# Standard errors by which a hypothesis must be worse than the best to lose.
+_WORSE = 2.0
+
+
+class Finding(NamedTuple):
+    """A hypothesis after it was fitted.
+
+    Attributes:
+      vessel: its model.
+      x: its unknowns.
+      covariance: their covariance.
+      error: mean robust error of the held-out pixels in sRGB.
+    """
+
+    vessel: Vessel
+    x: Float[np.ndarray, " unknowns"]
+    covariance: Float[np.ndarray, "n n"]
+    error: float
+
+
+class Found(NamedTuple):
+    """Result of a search.
+
+    Attributes:
+      best: the simplest finding that is not significantly worse than the best.
+      findings: all findings, in the order of their number of unknowns.
+      looks: all hypotheses that were looked at, the best first.
+    """
+
+    best: Finding
+    findings: list[Finding]
+    looks: list[Look]
+
+
+class Few:
+    """A model of which only some combinations of the unknowns may change.
+
+    Attributes:
+      model: the model.
+      origin: its unknowns at rest.
+      directions: how they change with each of the few.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        origin: Float[np.ndarray, " unknowns"],
+        directions: Float[np.ndarray, "unknowns few"],
+    ) -> None:
+        """Takes the model and the combinations."""
+        self.model, self.origin, self.directions = model, origin, directions
+
+    def start(self) -> Float[np.ndarray, " few"]:
+        """Returns zeros."""
+        return np.zeros(self.directions.shape[1])
+
+    def whole(self, x: Float[np.ndarray, " few"]) -> Float[np.ndarray, " unknowns"]:
+        """Returns the unknowns of the model."""
+        return self.origin + self.directions @ x
+
+    def pose(self, x: Float[np.ndarray, " few"]) -> Candidate:
+        """Returns the scene."""
+        found = self.model.pose(self.whole(x))
+        parts = tuple(
+            part._replace(
+                by_vertices=np.asarray(part.by_vertices @ self.directions),
+                by_normals=np.asarray(part.by_normals @ self.directions),
+            )
+            for part in found.parts
+        )
+        few = scipy.sparse.csr_array(self.directions)
+        return Candidate(parts, found.interfaces, found.by_indices @ few, found.by_tints @ few)
+
+    def prior(self, x: Float[np.ndarray, " few"]) -> tuple[Matrix, Float[np.ndarray, " few"]]:
+        """Returns the prior of the model."""
+        precision, gradient = self.model.prior(self.whole(x))
+        return self.directions.T @ precision @ self.directions, self.directions.T @ gradient
+
+    def scales(self) -> Float[np.ndarray, " few"]:
+        """Returns the largest change of each."""
+        ratios = np.abs(self.directions) / self.model.scales()[:, None]
+        return 1.0 / np.max(ratios, axis=0)
+
+
+def unexplained(error: float, floor: float) -> bool:
+    """Returns whether the error of the best single body calls for a search of what is inside.
+
+    Args:
+      error: mean robust error of pixels through the body (`gauss_newton.errors_of`).
+      floor: mean robust error of pixels beside it, which see the backdrop directly.
+    """
+    return error > _UNEXPLAINED * floor
+
+
+def search(
+    body: Revolution,
+    surface: Backdrop,
+    pixels: Photographs,
+    judges: Photographs,
+    *,
+    settings: SearchSettings | None = None,
+    detail: Detail = FINE,
+    outlines: Callable[[Candidate], Rows] | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Found:
+    """Finds what is inside a vessel.
+
+    Args:
+      body: the outer surface, fitted to masks only.
+      surface: backdrop.
+      pixels: pixels that see the vessel, of photographs to fit to.
+      judges: pixels of other photographs, which decide between hypotheses.
+      settings: settings of the search.
+      detail: resolution of the meshes of the last fit.
+      outlines: equations of the masks' outlines, for the last fit.
+      progress: called with a line about each fit.
+
+    Raises:
+      ReconstructionError: if there are no pixels, or the body is a ring.
+    """
+    if not len(pixels.views) or not len(judges.views):
+        raise ReconstructionError("No pixel sees the object. Check the masks and the cameras.")
+    settings, say = settings or SearchSettings(), progress or (lambda line: None)
+    looks = looks_at_all(body, surface, pixels, settings)
+    say(f"{len(looks)} looks; best: {looks[0].interior.name}, error {looks[0].error:.4f}")
+    rough = []
+    for found in finalists(looks, settings):
+        finding = _few_fitted(body, found.interior, surface, pixels, judges, settings)
+        say(f"{found.interior.name}: looked {found.error:.4f}, error {finding.error:.4f}")
+        rough.append(finding)
+    findings = []
+    for each in _best_of_kinds(rough, settings):
+        vessel = Vessel(body, _with_gap(body, each, surface, pixels, settings), detail)
+        finding = _fitted(vessel, surface, pixels, judges, settings, outlines)
+        say(f"{each.vessel.interior_at_start.name}: all unknowns, error {finding.error:.4f}")
+        findings.append(finding)
+    return Found(select(findings, surface, judges), findings, looks)
+
+
+def _few_fitted(
+    body: Revolution,
+    interior: Interior,
+    surface: Backdrop,
+    pixels: Photographs,
+    judges: Photographs,
+    settings: SearchSettings,
+) -> Finding:
+    """Returns a hypothesis after steps of its few numbers and of the thickness of its wall."""
+    vessel = Vessel(body, interior, COARSE)
+    x, layout = vessel.start(), vessel.layout
+    one = np.eye(len(x))
+    columns = [one[:, layout.outer].sum(axis=1)]
+    if layout.inner.stop > layout.inner.start:
+        columns.append(one[:, layout.inner].sum(axis=1))
+    columns += list(one[:, layout.inner.stop :].T)
+    few = Few(vessel, x, np.stack(columns, axis=1))
+    steps = Steps(settings.few, settings.rays, settings.rays, _OUTLIERS, seed=settings.seed)
+    fit = gauss_newton.fit(few, few.start(), surface, pixels, settings=steps)
+    return _finding(vessel, few.whole(fit.x), fit.covariance, surface, judges)
+
+
+def _fitted(
+    vessel: Vessel,
+    surface: Backdrop,
+    pixels: Photographs,
+    judges: Photographs,
+    settings: SearchSettings,
+    outlines: Callable[[Candidate], Rows] | None,
+) -> Finding:
+    """Returns a hypothesis after steps of all unknowns."""
+    steps = Steps(settings.all, settings.last_rays, settings.rays, _OUTLIERS, seed=settings.seed)
+    x = vessel.start()
+    fit = gauss_newton.fit(vessel, x, surface, pixels, settings=steps, outlines=outlines)
+    return _finding(vessel, fit.x, fit.covariance, surface, judges)
+
+
+def _finding(
+    vessel: Vessel,
+    x: Float[np.ndarray, " unknowns"],
+    covariance: Float[np.ndarray, "few few"],
+    surface: Backdrop,
+    judges: Photographs,
+) -> Finding:
+    errors = gauss_newton.errors_of(gauss_newton.body_of(vessel.pose(x)), surface, judges)
+    return Finding(vessel, x, covariance, float(errors.mean()))
+
+
+def _with_wall(finding: Finding) -> Interior:
+    """Returns the interior of a finding, with its thickness as that of the wall at rest."""
+    vessel, x = finding.vessel, finding.x
+    interior, layout = vessel.interior(x), vessel.layout
+    if layout.inner.stop == layout.inner.start:
+        return interior
+    wall = interior.wall - float(x[layout.inner].mean())
+    return dataclasses.replace(interior, wall=max(wall, 0.5 * interior.wall))
+
+
+def _with_gap(
+    body: Revolution,
+    finding: Finding,
+    surface: Backdrop,
+    pixels: Photographs,
+    settings: SearchSettings,
+) -> Interior:
+    """Returns the interior of a finding with the gap that suits it best.
+
+    A thin gap does not show which way it should grow, so several are looked at, upwards from the
+    level and downwards from the air.
+    """
+    at, size = _with_wall(finding), extent(body)[0]
+    if not at.level_unknown:
+        return at
+    generator = np.random.default_rng(settings.seed + 1)
+    some = pixels.chosen(draw(generator, len(pixels.views), settings.pixels))
+    blurred = photometry.blurred(surface, _GAP_BLUR)
+    found = [look(body, at, blurred, some)]
+    for gap in _GAPS:
+        for shift in (0.0, at.gap - gap * size):
+            other = dataclasses.replace(at, gap=gap * size, level=at.level + shift)
+            found.append(look(body, other, blurred, some))
+    return min(found, key=lambda each: each.error).interior
+
+
+def _best_of_kinds(findings: Sequence[Finding], settings: SearchSettings) -> list[Finding]:
+    """Returns the best finding of each kind that is not far worse than the best, simple first."""
+    found: dict[str, Finding] = {}
+    for each in sorted(findings, key=lambda each: each.error):
+        found.setdefault(each.vessel.interior_at_start.name, each)
+    best = min(each.error for each in findings)
+    kept = [each for each in found.values() if each.error < settings.rivals * best]
+    return sorted(kept, key=lambda each: len(each.x))
+
+
+def select(findings: Sequence[Finding], surface: Backdrop, judges: Photographs) -> Finding:
+    """Returns the simplest finding whose error is not significantly above the least.
+
+    It must not be worse than the best by more than two standard errors of the mean over views.
+
+    Args:
+      findings: findings, the simplest first.
+      surface: backdrop.
+      judges: pixels that none was fitted to.
+    """
+    errors = [
+        gauss_newton.errors_of(gauss_newton.body_of(each.vessel.pose(each.x)), surface, judges)
+        for each in findings
+    ]
+    best = errors[int(np.argmin([each.mean() for each in errors]))]
+    _, view = np.unique(judges.views, return_inverse=True)
+    counts = np.bincount(view)
+    for finding, error in zip(findings, errors, strict=True):
+        worse = np.bincount(view, error - best) / counts
+        deviation = np.std(worse, ddof=1) / np.sqrt(len(counts)) if len(counts) > 1 else 0.0
+        if worse.mean() <= _WORSE * deviation:
+            return finding
+    return findings[int(np.argmin([each.error for each in findings]))]

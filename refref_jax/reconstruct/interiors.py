@@ -1,0 +1,505 @@
+"""Vessels of glass with liquid and air inside: bodies of revolution, as unknowns of a fit.
+
+A vessel has an outer and an inner wall, both profiles around an upright axis that move along their
+normals (`walls`). What is inside is cut by horizontal surfaces: liquid up to a level, glass of a
+small height (the *gap*), and air above. The mouth may be open; then the glass ends at a rim, and
+the air inside is that outside. `Vessel` is a `gauss_newton.Model`; `interior_search` finds out what
+is inside.
+
+What this can not represent: handles and spouts; a tilted level, or its rise at the wall; drops and
+bubbles; liquid in a ring around a raised bottom that is higher than the level; tilted vessels;
+walls that reach into each other; a stopper of another material.
+
+Source: ours. Kim, Reshetouski, Ghosh: Acquiring Axially-Symmetric Transparent Objects Using
+Single-View Transmission Imaging (2017), for outer and inner profiles from refracted light.
+"""
+
+import dataclasses
+from typing import Literal, NamedTuple
+
+import numpy as np
+import scipy.sparse
+from jaxtyping import Float, Int
+from scipy.spatial import KDTree
+
+from refref_jax.geometry.triangle_meshes import Mesh
+from refref_jax.optics.interface_rules import NO_PARENT, nested
+from refref_jax.reconstruct import ReconstructionError, walls
+from refref_jax.reconstruct.families import Revolution, place
+from refref_jax.reconstruct.gauss_newton import Candidate
+from refref_jax.reconstruct.revolution import Curve, Profile, lathe
+from refref_jax.reconstruct.shapes import LARGEST_STEP, LARGEST_TURN, Posed, mesh_of
+from refref_jax.reconstruct.walls import Limits, Moved, Outline, Stretch, Wall
+
+Colour = tuple[float, float, float]
+"""Linear RGB."""
+
+Contents = Literal["none", "air", "liquid", "liquid and air"]
+"""What is inside the glass; `none` is solid glass."""
+
+# Knots of the offsets of the outer and of the inner wall.
+_KNOTS, _INNER_KNOTS = 36, 28
+
+# Standard deviations of the priors, as shares of the diameter: shift of the axis; offsets of the
+# outer wall and their second differences; the same of the inner wall; level; gap. Angles are in
+# radians.
+_ANGLE, _SHIFT = 0.02, 0.01
+_OFFSET, _BEND = 0.008, 0.004
+_INNER_OFFSET, _INNER_BEND = 0.03, 0.012
+_LEVEL, _GAP = 0.12, 0.04
+
+# The same of the indices of glass and liquid, and of the logarithm of a tint.
+_GLASS, _LIQUID, _TINT = 0.03, 0.1, 1.0
+
+# Largest changes in a step: of level and gap, as a share of the diameter, of an index, and of the
+# logarithm of a tint. The inner wall, which no mask shows, moves further than the outer one.
+_LEVEL_STEP, _INDEX_STEP, _TINT_STEP = 0.015, 0.02, 0.3
+_INNER_STEPS = 2.0
+
+# Least thickness of a wall and of its gap, as a share of the diameter, and of the wall at rest.
+_THINNEST, _LEAST_GAP, _LEAST_SHARE = 0.002, 0.001, 0.25
+
+# Share of the distance from the axis that an inner wall may move inwards.
+_INWARDS = 0.7
+
+# Offsets fade into their limits over this share of them.
+_FADE = 0.1
+
+# Number of interfaces of every vessel: those without faces let all share one compiled program.
+_PARTS = 3
+
+# Fewest points of a piece of the inner wall.
+_FEWEST = 20
+
+# A mouth begins where the inner wall has turned this far from the horizontal.
+_UPRIGHT = 0.8
+
+
+class Detail(NamedTuple):
+    """Resolution of the meshes of a vessel.
+
+    Attributes:
+      outer: points along the outer wall.
+      inner: points along the inner wall, all of its pieces together.
+      azimuths: number of half-planes.
+    """
+
+    outer: int = 112
+    inner: int = 124
+    azimuths: int = 96
+
+
+FINE = Detail()
+"""Enough for photographs of 200 x 200 pixels."""
+
+COARSE = Detail(outer=72, inner=80, azimuths=64)
+"""Enough for a look through a blurred backdrop."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Interior:
+    """What is inside a vessel, and of what it is made.
+
+    Attributes:
+      contents: what is inside.
+      mouth: whether the vessel is open.
+      wall: distance of the inner from the outer wall at rest, world units.
+      level: height of the liquid's surface above the point of the axis, world units.
+      gap: height of the glass between liquid and air, world units.
+      glass: index of refraction of the glass.
+      liquid: the same of the liquid.
+      tint: factor on light at each crossing of the liquid's surface, linear RGB.
+      glass_tint: the same of the glass.
+      stained: whether the tint of the glass is unknown.
+    """
+
+    contents: Contents = "liquid and air"
+    mouth: bool = False
+    wall: float = 0.1
+    level: float = 0.0
+    gap: float = 0.01
+    glass: float = 1.5
+    liquid: float = 1.36
+    tint: Colour = (1.0, 1.0, 1.0)
+    glass_tint: Colour = (1.0, 1.0, 1.0)
+    stained: bool = False
+
+    @property
+    def filled(self) -> bool:
+        """Whether there is liquid."""
+        return self.contents in ("liquid", "liquid and air")
+
+    @property
+    def name(self) -> str:
+        """What is inside, in words."""
+        return self.contents + (", open" if self.mouth else "")
+
+    @property
+    def level_unknown(self) -> bool:
+        """Whether the liquid has a surface."""
+        return self.contents == "liquid and air"
+
+
+@dataclasses.dataclass(frozen=True)
+class Solid:
+    """A part of a scene.
+
+    Attributes:
+      name: what it is of.
+      mesh: its surface.
+      index: index of refraction inside.
+      parent: part that contains it, or `NO_PARENT`.
+      tint: factor on light at each crossing of its surface, linear RGB.
+    """
+
+    name: str
+    mesh: Mesh
+    index: float
+    parent: int
+    tint: Colour
+
+
+class Layout:
+    """Where the unknowns of a vessel are; slices, empty for what it does not have."""
+
+    def __init__(self, interior: Interior, outer: int, inner: int) -> None:
+        """Counts the unknowns."""
+        self.axis, self.outer = slice(0, 4), slice(4, 4 + outer)
+        at = 4 + outer
+
+        def take(count: int) -> slice:
+            nonlocal at
+            at += count
+            return slice(at - count, at)
+
+        self.inner = take(inner if interior.contents != "none" else 0)
+        self.level, self.gap = take(interior.level_unknown), take(interior.level_unknown)
+        self.profile = at - 4
+        self.glass, self.liquid = take(1), take(interior.filled)
+        self.tint, self.glass_tint = take(3 * interior.filled), take(3 * interior.stained)
+        self.count = at
+
+    def names(self) -> list[str]:
+        """Returns a name for each unknown."""
+        found = [""] * self.count
+        for name, each in vars(self).items():
+            if isinstance(each, slice):
+                for number in range(each.start, each.stop):
+                    found[number] = name
+        return found
+
+
+class Vessel:
+    """A vessel as a `gauss_newton.Model`.
+
+    The unknowns (`layout`) are the tilt and the shift of the axis, offsets of the outer and of the
+    inner wall along their normals at rest, the level, the gap, the indices of glass and liquid, and
+    the logarithms of the tints. The connectivity does not depend on them.
+
+    Example:
+      >>> vessel = Vessel(fit_revolution(mesh), Interior("liquid and air", wall=0.1, level=-0.2))
+      >>> fit = gauss_newton.fit(vessel, vessel.start(), surface, pixels)
+      >>> vessel.interior(fit.x).level
+
+    Attributes:
+      interior: what is inside at the start.
+      layout: where the unknowns are.
+      size: diameter, world units.
+    """
+
+    def __init__(self, body: Revolution, interior: Interior, detail: Detail = FINE) -> None:
+        """Takes the outer surface and what is inside.
+
+        Raises:
+          ReconstructionError: if the body is a ring, or its wall leaves no space inside.
+        """
+        if body.closed:
+            raise ReconstructionError("A ring has no inside that the axis meets. Pass a vessel.")
+        self.body, self.interior_at_start, self.detail = body, interior, detail
+        profile = Profile(body.points, closed=False)
+        self.size = _size(body.points)
+        self._outer = Wall(profile, points=detail.outer, knots=_KNOTS)
+        self.layout = Layout(interior, _KNOTS, _INNER_KNOTS)
+        if interior.contents != "none":
+            space = walls.inset(profile, interior.wall, self.size)
+            if space is None:
+                raise ReconstructionError(
+                    f"A wall of {interior.wall:g} leaves no space inside. Pass a thinner one."
+                )
+            self._inner = Wall(space, points=detail.inner, knots=_INNER_KNOTS)
+            self._rest = self._limits()
+            heights = self._inner.points[:, 1]
+            margin = 2.0 * _THINNEST * self.size
+            self._range = float(heights.min()) + margin, float(heights.max()) - margin
+            if interior.mouth:
+                self._rim = self._find_rim()
+        self._plan = self._shares()
+
+    def _limits(self) -> tuple[Limits, Int[np.ndarray, " points"]]:
+        """Returns the limits of the inner wall at rest, and the nearest points of the outer one."""
+        points, directions = self._inner.points, self._inner.directions
+        dense = np.linspace(0.0, self._outer.length, 8 * len(self._outer.at))
+        moved = Moved(self._outer.points, np.zeros((len(self._outer.points), 2, 0)))
+        outer = self._outer.piece(moved, dense, np.zeros((len(dense), 0))).points
+        away, nearest = KDTree(outer).query(points)
+        least = np.minimum(_LEAST_SHARE * away, _THINNEST * self.size)
+        half = 0.5 * (points[:, 1].max() - points[:, 1].min())
+        across = points[:, 0] / np.maximum(np.abs(directions[:, 0]), 1e-9)
+        upright = np.where(np.abs(directions[:, 0]) > 0.1, across, half)
+        inward = -_INWARDS * np.clip(upright, 2.0 * _THINNEST * self.size, half)
+        outward = away - least
+        width = _FADE * np.minimum(outward, -inward)
+        rows = np.clip(np.searchsorted(self._outer.at, dense[nearest]), 0, len(self._outer.at) - 1)
+        empty = np.zeros((len(points), 0))
+        return Limits(inward, outward, empty, width), rows
+
+    def _find_rim(self) -> tuple[float, float]:
+        """Returns the lengths at which the outer and the inner wall end at the mouth."""
+        upright = np.flatnonzero(self._inner.directions[:, 0] > _UPRIGHT)
+        last = int(upright[-1])
+        radius = self._inner.points[last, 0]
+        high = self._outer.points[:, 1] > self._inner.points[last, 1]
+        wide = np.flatnonzero(high & (self._outer.points[:, 0] > radius))
+        if not len(wide) or wide[-1] + 1 >= len(self._outer.at):
+            raise ReconstructionError("The vessel has no mouth at its top. Pass mouth=False.")
+        (r, s), at = self._outer.points[wide[-1] : wide[-1] + 2, 0], self._outer.at
+        share = (r - radius) / max(r - s, 1e-12)
+        begin, end = at[wide[-1]], at[wide[-1] + 1]
+        return float(begin + share * (end - begin)), float(self._inner.at[last])
+
+    def _shares(self) -> list[Float[np.ndarray, " points"]]:
+        """Returns where points are: shares of the outer wall, of the liquid's and of the air's."""
+        interior, outer = self.interior_at_start, self._outer
+        end = self._rim[0] if interior.mouth else outer.length
+        found = [walls.shares(outer.at, 0.0, end, len(outer.at))]
+        if interior.contents == "none":
+            return found
+        inner = self._inner
+        count, cut = len(inner.at), inner.length
+        if interior.level_unknown:
+            still = Moved(inner.points, np.zeros((count, 2, 0)))
+            cut, _ = inner.reach(still, float(np.clip(interior.level, *self._range)), np.zeros(0))
+            # The number of points below depends on the level at rest; that of all does not.
+            count = int(np.clip(np.searchsorted(inner.at, cut), _FEWEST, count - _FEWEST))
+        found.append(walls.shares(inner.at, 0.0, cut, count))
+        end = self._rim[1] if interior.mouth else inner.length
+        begin = cut if interior.level_unknown else 0.0
+        rest = len(inner.at) - count if interior.level_unknown else count
+        return [*found, walls.shares(inner.at, begin, end, rest)]
+
+    def start(self) -> Float[np.ndarray, " unknowns"]:
+        """Returns the unknowns at rest."""
+        x, interior, layout = np.zeros(self.layout.count), self.interior_at_start, self.layout
+        x[layout.level], x[layout.gap] = interior.level, interior.gap
+        x[layout.glass], x[layout.liquid] = interior.glass, interior.liquid
+        for where, tint in ((layout.tint, interior.tint), (layout.glass_tint, interior.glass_tint)):
+            if where.stop > where.start:
+                x[where] = np.log(tint)
+        return x
+
+    def interior(self, x: Float[np.ndarray, " unknowns"]) -> Interior:
+        """Returns what is inside at given unknowns; the wall is the mean one."""
+        layout, rest = self.layout, self.interior_at_start
+        numbers = {"level": rest.level, "gap": rest.gap, "glass": rest.glass, "liquid": rest.liquid}
+        for name in numbers:
+            values = x[getattr(layout, name)]
+            if len(values):
+                numbers[name] = float(values[0])
+        if rest.level_unknown:
+            numbers["level"] = float(np.clip(numbers["level"], *self._range))
+            numbers["gap"] = max(numbers["gap"], _LEAST_GAP * self.size)
+
+        def tint(where: slice, otherwise: Colour) -> Colour:
+            if where.stop == where.start:
+                return otherwise
+            red, green, blue = np.exp(x[where])
+            return float(red), float(green), float(blue)
+
+        return dataclasses.replace(
+            rest,
+            level=numbers["level"],
+            gap=numbers["gap"],
+            glass=numbers["glass"],
+            liquid=numbers["liquid"],
+            tint=tint(layout.tint, rest.tint),
+            glass_tint=tint(layout.glass_tint, rest.glass_tint),
+        )
+
+    def pose(self, x: Float[np.ndarray, " unknowns"]) -> Candidate:
+        """Returns the vessel at given unknowns."""
+        zeros = len(x) - 4 - self.layout.profile
+        parts = [self._posed(outline, x, zeros) for outline in self._pieces(x)]
+        interior, layout = self.interior(x), self.layout
+        kinds = self._kinds()
+        kinds += ["air"] * (_PARTS - len(kinds))
+        index = {"glass": interior.glass, "liquid": interior.liquid, "air": 1.0}
+        tint = {"glass": interior.glass_tint, "liquid": interior.tint, "air": (1.0, 1.0, 1.0)}
+        by_indices, by_tints = np.zeros((len(kinds), len(x))), np.zeros((3 * len(kinds), len(x)))
+        tints = {"glass": layout.glass_tint, "liquid": layout.tint}
+        for number, kind in enumerate(kinds):
+            if kind != "air":
+                by_indices[number, getattr(layout, kind)] = 1.0
+                where = tints[kind]
+                rows = slice(3 * number, 3 * number + where.stop - where.start)
+                by_tints[rows, where] = np.eye(where.stop - where.start)
+        interfaces = nested(
+            [index[kind] for kind in kinds],
+            [NO_PARENT] + [0] * (len(kinds) - 1),
+            tints=[tint[kind] for kind in kinds],
+        )
+        return Candidate(
+            tuple(parts),
+            interfaces,
+            scipy.sparse.csr_array(by_indices),
+            scipy.sparse.csr_array(by_tints),
+        )
+
+    def _kinds(self) -> list[str]:
+        """Returns the material of each part."""
+        interior = self.interior_at_start
+        inside = ["liquid"] if interior.filled else []
+        air = interior.contents in ("air", "liquid and air") and not interior.mouth
+        return ["glass", *inside, *(["air"] if air else [])]
+
+    def _posed(self, outline: Outline, x: Float[np.ndarray, " unknowns"], zeros: int) -> Posed:
+        """Returns a profile turned around the axis, with columns for all unknowns."""
+        shift, azimuths = np.append(x[:4], 0.0), self.detail.azimuths
+        connected = lathe(outline.poles, outline.segments, outline.ends, azimuths)
+        posed = place(outline.turned, connected, azimuths, self.body.axis, shift)
+
+        def columns(matrix: np.ndarray) -> np.ndarray:
+            # A shift along the axis is an offset of the profile.
+            nothing = np.zeros((len(matrix), zeros))
+            return np.concatenate([matrix[:, :4], matrix[:, 5:], nothing], axis=1)
+
+        return posed._replace(
+            by_vertices=columns(posed.by_vertices), by_normals=columns(posed.by_normals)
+        )
+
+    def _pieces(self, x: Float[np.ndarray, " unknowns"]) -> list[Outline]:
+        """Returns the closed profiles of the parts."""
+        interior, layout = self.interior_at_start, self.layout
+        by = np.eye(len(x))[:, 4 : 4 + layout.profile]
+        outer = self._outer.curve(x[layout.outer], by[layout.outer])
+        still = np.zeros(layout.profile)
+        whole = walls.between(self._outer, outer, self._plan[0], (0.0, still), (None, still))
+        if interior.contents == "none":
+            return [walls.joined([whole])]
+        inner = self._inner_wall(x, by)
+        if interior.level_unknown:
+            levels = self._levels(x, by)
+            inside = self._cut(inner, levels, still)
+            bottom = self._inner.reach(inner, *levels[1])
+        else:
+            full = walls.between(self._inner, inner, self._plan[1], (0.0, still), (None, still))
+            inside, bottom = [walls.joined([full])], (0.0, still)
+        if not interior.mouth:
+            return [walls.joined([whole]), *inside]
+        glass = self._open(outer, inner, bottom, still)
+        if interior.level_unknown:
+            glass.append(walls.disc(glass[-1].last(), *levels[1]))
+        return [walls.joined(glass), *inside[: interior.filled]]
+
+    def _inner_wall(
+        self, x: Float[np.ndarray, " unknowns"], by: Float[np.ndarray, "unknowns m"]
+    ) -> Moved:
+        """Returns the inner wall, which the outer one limits."""
+        rest, rows = self._rest
+        hats, where = self._outer.hats[rows], self.layout.outer
+        limits = rest._replace(outward=rest.outward + hats @ x[where], by_outward=hats @ by[where])
+        return self._inner.curve(x[self.layout.inner], by[self.layout.inner], limits)
+
+    def _levels(
+        self, x: Float[np.ndarray, " unknowns"], by: Float[np.ndarray, "unknowns m"]
+    ) -> list[tuple[float, Float[np.ndarray, " m"]]]:
+        """Returns the heights of the liquid's surface and of the lower end of the air."""
+        layout, now = self.layout, self.interior(x)
+        by_level = by[layout.level][0] * (now.level == x[layout.level][0])
+        by_top = by_level + by[layout.gap][0] * (now.gap == x[layout.gap][0])
+        return [(now.level, by_level), (now.level + now.gap, by_top)]
+
+    def _cut(
+        self,
+        inner: Moved,
+        levels: list[tuple[float, Float[np.ndarray, " m"]]],
+        still: Float[np.ndarray, " m"],
+    ) -> list[Outline]:
+        """Returns the liquid and the air."""
+        low, high = (self._inner.reach(inner, *level) for level in levels)
+        below = walls.between(self._inner, inner, self._plan[1], (0.0, still), low)
+        above = walls.between(self._inner, inner, self._plan[2], high, (None, still))
+        surface = walls.disc(below.last(), *levels[0])
+        return [
+            walls.joined([below, surface]),
+            walls.joined([walls.disc(above.first(), *levels[1]).reversed(), above]),
+        ]
+
+    def _open(
+        self,
+        outer: Moved,
+        inner: Moved,
+        bottom: tuple[float, Float[np.ndarray, " m"]],
+        still: Float[np.ndarray, " m"],
+    ) -> list[Stretch]:
+        """Returns the glass of an open vessel: outside up to the rim, and inside down again."""
+        ends = [(end, still) for end in self._rim]
+        outside = walls.between(self._outer, outer, self._plan[0], (0.0, still), ends[0])
+        down = walls.between(self._inner, inner, self._plan[2], bottom, ends[1]).reversed()
+        return [outside, walls.bridge(outside, down), down]
+
+    def solids(self, x: Float[np.ndarray, " unknowns"]) -> list[Solid]:
+        """Returns the parts of the vessel, as those of an ordinary scene.
+
+        The part `glass` contains the others.
+        """
+        now, candidate = self.interior(x), self.pose(x)
+        tints = {"glass": now.glass_tint, "liquid": now.tint, "air": (1.0, 1.0, 1.0)}
+        indices = {"glass": now.glass, "liquid": now.liquid, "air": 1.0}
+        return [
+            Solid(name, mesh_of(part), indices[name], 0 if number else NO_PARENT, tints[name])
+            for number, (name, part) in enumerate(zip(self._kinds(), candidate.parts, strict=True))
+        ]
+
+    def prior(
+        self, x: Float[np.ndarray, " unknowns"]
+    ) -> tuple[Float[np.ndarray, "unknowns unknowns"], Float[np.ndarray, " unknowns"]]:
+        """Returns the prior: near the start, and smooth walls. Deviations: see the constants."""
+        layout, size = self.layout, self.size
+        deviations = np.full(layout.count, _TINT)
+        for where, deviation in (
+            (layout.axis, np.array([_ANGLE, _ANGLE, _SHIFT * size, _SHIFT * size])),
+            (layout.outer, _OFFSET * size),
+            (layout.inner, _INNER_OFFSET * size),
+            (layout.level, _LEVEL * size),
+            (layout.gap, _GAP * size),
+            (layout.glass, _GLASS),
+            (layout.liquid, _LIQUID),
+        ):
+            deviations[where] = deviation
+        precision = np.diag(deviations**-2.0)
+        for where, bend in ((layout.outer, _BEND), (layout.inner, _INNER_BEND)):
+            count = where.stop - where.start
+            if count:
+                bends = np.diff(np.eye(count), 2, axis=0)
+                precision[where, where] += bends.T @ bends / (bend * size) ** 2
+        away = x - self.start()
+        away[layout.tint] = x[layout.tint]
+        away[layout.glass_tint] = x[layout.glass_tint]
+        return precision, precision @ away
+
+    def scales(self) -> Float[np.ndarray, " unknowns"]:
+        """Returns the largest change of each unknown in one step."""
+        layout, size = self.layout, self.size
+        found = np.full(layout.count, LARGEST_STEP * size)
+        found[:2] = LARGEST_TURN
+        found[layout.inner] *= _INNER_STEPS
+        found[layout.level] = found[layout.gap] = _LEVEL_STEP * size
+        found[layout.glass] = found[layout.liquid] = _INDEX_STEP
+        found[layout.tint] = found[layout.glass_tint] = _TINT_STEP
+        return found
+
+
+def _size(points: Curve) -> float:
+    """Returns the diameter of a body of revolution: the diagonal of its box."""
+    across, height = 2.0 * points[:, 0].max(), points[:, 1].max() - points[:, 1].min()
+    return float(max(across, height))

@@ -1,0 +1,405 @@
+"""Walls of vessels: profiles that move along their normals, and pieces of them (NumPy only).
+
+A `Wall` is a profile from the lowest point of the axis to the highest (`revolution`), moved along
+its normals at rest by a cubic spline of offsets. `curve` returns it at given offsets with exact
+derivatives; `piece` samples part of it, between ends that may move too, as the wall below the level
+of a liquid does. `inset` returns the wall inside another one, at a distance from it.
+
+Source: ours.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial import KDTree
+
+from refref_jax.reconstruct import ReconstructionError
+from refref_jax.reconstruct.families import Turned
+from refref_jax.reconstruct.revolution import Curve, Profile, Section, outline, profile_normals
+
+# Points of a profile while it is prepared, and cells along the diameter while it is inset.
+_STEPS, _CELLS = 600, 300
+
+# Empty cells around a section.
+_MARGIN = 4
+
+# Smoothing of a profile that was inset, and of the turns that attract points, in steps.
+_SMOOTHING, _TURNS = 3.0, 4.0
+
+# Circles of a horizontal surface, with its rim and its middle.
+_RINGS = 4
+
+# Smallest slope of the height along a wall that still moves the point at a given height.
+_FLAT = 0.1
+
+
+class Moved(NamedTuple):
+    """A wall at given offsets.
+
+    Attributes:
+      points: points of its spline.
+      by_points: their derivatives by m unknowns.
+    """
+
+    points: Float[np.ndarray, "points 2"]
+    by_points: Float[np.ndarray, "points 2 m"]
+
+
+class Limits(NamedTuple):
+    """How far the points of a wall may move along their normals, with derivatives.
+
+    Attributes:
+      inward: least offset, negative.
+      outward: largest offset, positive.
+      by_outward: derivatives of the largest offset by m unknowns.
+      width: distance from the limits at which they begin to be felt.
+    """
+
+    inward: Float[np.ndarray, " points"]
+    outward: Float[np.ndarray, " points"]
+    by_outward: Float[np.ndarray, "points m"]
+    width: Float[np.ndarray, " points"]
+
+
+class Wall:
+    """A profile that begins and ends on the axis, and moves along its normals.
+
+    Attributes:
+      at: lengths along the profile at rest of the points of its spline.
+      length: length of the profile at rest.
+      points: these points at rest: radius and height.
+      directions: outward unit normals at rest.
+      hats: offset of each point by that of each knot.
+    """
+
+    def __init__(self, profile: Profile, *, points: int = 160, knots: int = 36) -> None:
+        """Takes a profile that is not closed, and the sizes of the splines."""
+        even = _even(profile.points, _STEPS)
+        length = _lengths(even)
+        self.length = float(length[-1])
+        self.at = places(even, points)
+        knot = places(even, knots)
+        self.points = np.stack(
+            [
+                CubicSpline(length, even[:, 0], bc_type="natural")(self.at),
+                CubicSpline(length, even[:, 1], bc_type="clamped")(self.at),
+            ],
+            axis=-1,
+        )
+        self.points[[0, -1], 0] = 0.0
+        one = np.eye(points)
+        self._radii = CubicSpline(self.at, one, bc_type="natural")
+        self._heights = CubicSpline(self.at, one, bc_type="clamped")
+        self.hats = CubicSpline(knot, np.eye(knots), bc_type="clamped")(self.at)
+        self.directions = self.normals(self.points)
+
+    def normals(self, points: Curve) -> Curve:
+        """Returns the outward unit normals of the spline through points."""
+        along = np.stack(
+            [self._radii(self.at, 1) @ points[:, 0], self._heights(self.at, 1) @ points[:, 1]], -1
+        )
+        return _turn_right(along) / np.linalg.norm(along, axis=-1, keepdims=True)
+
+    def curve(
+        self,
+        offsets: Float[np.ndarray, " knots"],
+        by_offsets: Float[np.ndarray, "knots m"],
+        limits: Limits | None = None,
+    ) -> Moved:
+        """Returns the wall at given offsets of the knots, outwards.
+
+        Args:
+          offsets: offsets, world units.
+          by_offsets: their derivatives by the unknowns.
+          limits: limits that the offsets fade into.
+        """
+        moves, slopes = self.hats @ offsets, self.hats @ by_offsets
+        if limits is not None:
+            moves, share = _below(moves, limits.outward, limits.width)
+            slopes = share[:, None] * slopes + (1.0 - share)[:, None] * limits.by_outward
+            moves, share = _below(-moves, -limits.inward, limits.width)
+            moves, slopes = -moves, share[:, None] * slopes
+        points = self.points + moves[:, None] * self.directions
+        return Moved(points, self.directions[:, :, None] * slopes[:, None])
+
+    def piece(
+        self,
+        moved: Moved,
+        at: Float[np.ndarray, " k"],
+        by_at: Float[np.ndarray, "k m"],
+    ) -> Turned:
+        """Returns points and normals of a wall at some lengths, which depend on the unknowns too.
+
+        Args:
+          moved: the wall.
+          at: lengths along the wall at rest.
+          by_at: their derivatives.
+        """
+        values, first, second = (self._sample(moved, at, order) for order in range(3))
+        points, along, bend = values[0], first[0], second[0]
+        by_points = values[1] + along[:, :, None] * by_at[:, None]
+        by_along = first[1] + bend[:, :, None] * by_at[:, None]
+        size = np.linalg.norm(along, axis=-1)[:, None]
+        normals, turned = _turn_right(along) / size, _turn_right(by_along) / size[..., None]
+        away = np.sum(normals[..., None] * turned, axis=1)[:, None]
+        return Turned(points, by_points, normals, turned - normals[..., None] * away)
+
+    def _sample(
+        self, moved: Moved, at: Float[np.ndarray, " k"], order: int
+    ) -> tuple[Float[np.ndarray, "k 2"], Float[np.ndarray, "k 2 m"]]:
+        """Returns derivatives of some order along the wall, and theirs by the unknowns."""
+        matrices = [spline(at, order) for spline in (self._radii, self._heights)]
+        points = np.stack([m @ moved.points[:, i] for i, m in enumerate(matrices)], axis=-1)
+        slopes = np.stack([m @ moved.by_points[:, i] for i, m in enumerate(matrices)], axis=1)
+        return points, slopes
+
+    def reach(
+        self, moved: Moved, height: float, by_height: Float[np.ndarray, " m"]
+    ) -> tuple[float, Float[np.ndarray, " m"]]:
+        """Returns the length at which a wall, going up from its lowest point, passes a height.
+
+        Args:
+          moved: the wall.
+          height: height, which is clipped to those that the wall reaches.
+          by_height: derivatives of the height.
+
+        Returns:
+          The length along the wall at rest, and its derivatives.
+        """
+        ticks = np.linspace(0.0, self.length, 2 * _STEPS)
+        heights = self._heights(ticks) @ moved.points[:, 1]
+        lowest = int(np.argmin(heights))
+        above = np.flatnonzero(heights[lowest:] > height)
+        last = lowest + int(above[0]) if len(above) else len(ticks) - 1
+        at = float(ticks[max(last, 1)])
+        for _ in range(4):
+            value, slope = (
+                float((self._heights(np.array([at]), order) @ moved.points[:, 1])[0])
+                for order in (0, 1)
+            )
+            step = (height - value) / max(slope, _FLAT)
+            at = float(np.clip(at + step, 0.0, self.length))
+        by_value = self._heights(np.array([at])) @ moved.by_points[:, 1]
+        return at, (by_height - by_value[0]) / max(slope, _FLAT)
+
+
+Point = tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2 m"]]
+"""A point of the half-plane and its derivatives."""
+
+
+class Stretch(NamedTuple):
+    """Part of a profile without creases.
+
+    Attributes:
+      turned: its points and normals, at least two.
+    """
+
+    turned: Turned
+
+    def reversed(self) -> "Stretch":
+        """Returns the same from the end to the beginning, of a body on the other side."""
+        points, by_points, normals, by_normals = (each[::-1] for each in self.turned)
+        return Stretch(Turned(points, by_points, -normals, -by_normals))
+
+    def first(self) -> Point:
+        """Returns the first point and its derivatives."""
+        return self.turned.points[0], self.turned.by_points[0]
+
+    def last(self) -> Point:
+        """Returns the last point and its derivatives."""
+        return self.turned.points[-1], self.turned.by_points[-1]
+
+
+class Outline(NamedTuple):
+    """A profile of several stretches, with creases between them.
+
+    Attributes:
+      turned: its points and normals; the stretches that meet at a point have two normals there.
+      poles: points on the axis.
+      segments: the two points of each segment.
+      ends: the two normals of each segment.
+    """
+
+    turned: Turned
+    poles: Bool[np.ndarray, " points"]
+    segments: Int[np.ndarray, "segments 2"]
+    ends: Int[np.ndarray, "segments 2"]
+
+
+End = tuple[float | None, Float[np.ndarray, " m"]]
+"""Length along a wall at rest and its derivatives; `None` is the whole length."""
+
+
+def between(
+    wall: Wall, moved: Moved, shares: Float[np.ndarray, " k"], begin: End, end: End
+) -> Stretch:
+    """Returns a stretch of a wall between two lengths.
+
+    Args:
+      wall: the wall.
+      moved: the same at some offsets.
+      shares: where the points are, from 0 to 1.
+      begin: first length.
+      end: last length.
+    """
+    first, last = (wall.length if each[0] is None else each[0] for each in (begin, end))
+    at = first + shares * (last - first)
+    by_at = begin[1] + shares[:, None] * (end[1] - begin[1])
+    return Stretch(wall.piece(moved, at, by_at))
+
+
+def shares(
+    at: Float[np.ndarray, " n"], begin: float, end: float, count: int
+) -> Float[np.ndarray, " count"]:
+    """Returns points from 0 to 1, as dense as those of a wall between two lengths."""
+    steps = np.arange(len(at))
+    first, last = (float(np.interp(each, at, steps)) for each in (begin, end))
+    found: np.ndarray = np.interp(np.linspace(first, last, count), steps, at)
+    return (found - begin) / max(end - begin, 1e-12)
+
+
+def disc(rim: Point, height: float, by_height: Float[np.ndarray, " m"]) -> Stretch:
+    """Returns a horizontal surface that faces up, from the rim to the axis.
+
+    Args:
+      rim: point of the rim, and its derivatives.
+      height: its height.
+      by_height: derivatives of the height.
+    """
+    scale = np.linspace(1.0, 0.0, _RINGS)
+    points = np.stack([scale * rim[0][0], np.full(_RINGS, height)], axis=-1)
+    by_points = np.stack(
+        [scale[:, None] * rim[1][0], np.broadcast_to(by_height, (_RINGS, len(by_height)))], axis=1
+    )
+    up = np.broadcast_to([0.0, 1.0], points.shape)
+    return Stretch(Turned(points, by_points, up, np.zeros(by_points.shape)))
+
+
+def bridge(before: Stretch, after: Stretch) -> Stretch:
+    """Returns the straight stretch between two others, which continues the second one."""
+    (point, by_point), (there, by_there) = before.last(), after.first()
+    normal, by_normal = after.turned.normals[0], after.turned.by_normals[0]
+    return Stretch(
+        Turned(
+            np.stack([point, there]),
+            np.stack([by_point, by_there]),
+            np.stack([normal, normal]),
+            np.stack([by_normal, by_normal]),
+        )
+    )
+
+
+def joined(stretches: Sequence[Stretch]) -> Outline:
+    """Joins stretches from a point of the axis to another, each from the end of the one before."""
+    counts = [len(each.turned.points) for each in stretches]
+    kept = [each.turned.points[number > 0 :] for number, each in enumerate(stretches)]
+    slopes = [each.turned.by_points[number > 0 :] for number, each in enumerate(stretches)]
+    points, by_points = np.concatenate(kept), np.concatenate(slopes)
+    poles = np.zeros(len(points), bool)
+    poles[[0, -1]] = True
+    steps = np.arange(len(points) - 1)
+    first = np.concatenate(
+        [np.arange(n - 1) + s for n, s in zip(counts, _starts(counts), strict=True)]
+    )
+    return Outline(
+        Turned(
+            points,
+            by_points,
+            np.concatenate([each.turned.normals for each in stretches]),
+            np.concatenate([each.turned.by_normals for each in stretches]),
+        ),
+        poles,
+        np.stack([steps, steps + 1], axis=-1),
+        np.stack([first, first + 1], axis=-1),
+    )
+
+
+def _starts(counts: Sequence[int]) -> Int[np.ndarray, " stretches"]:
+    return np.cumsum(counts) - counts
+
+
+def places(points: Curve, count: int) -> Float[np.ndarray, " count"]:
+    """Returns lengths along a curve, half of them even and half where it turns."""
+    length = _lengths(points)
+    along = np.diff(points, axis=0)
+    angle = np.unwrap(np.arctan2(along[:, 1], along[:, 0]))
+    turn = np.abs(gaussian_filter1d(np.diff(angle, prepend=angle[:1]), _TURNS, mode="nearest"))
+    turn = gaussian_filter1d(turn, _TURNS, mode="nearest")
+    share = np.diff(length) / length[-1] + turn / max(turn.sum(), 1e-12)
+    total = np.concatenate([[0.0], np.cumsum(share)])
+    return np.interp(np.linspace(0.0, total[-1], count), total, length)
+
+
+def inset(profile: Profile, distance: float, size: float) -> Profile | None:
+    """Returns the curve at a distance inside a profile that encloses the largest body.
+
+    It is the contour of the distance from the profile, so it has no loops where the profile bends
+    more sharply than the distance, or is narrow.
+
+    Args:
+      profile: profile that begins and ends on the axis.
+      distance: distance, world units.
+      size: diameter of the body.
+
+    Returns:
+      The curve; `None` if nothing is further inside.
+
+    Raises:
+      ReconstructionError: if the profile is closed, or scikit-image is not installed.
+    """
+    if profile.closed:
+        raise ReconstructionError("A ring has no inside that the axis meets. Pass a vessel.")
+    cell = size / _CELLS
+    even = _even(profile.points, 4 * _STEPS)
+    low, high = even[:, 1].min(), even[:, 1].max()
+    bottom = float(low) - _MARGIN * cell
+    rows = int((high - bottom) / cell) + 2 * _MARGIN
+    columns = int(even[:, 0].max() / cell) + 2 * _MARGIN
+    row, column = np.mgrid[:rows, :columns]
+    centres = np.stack([(column + 0.5) * cell, bottom + (row + 0.5) * cell], axis=-1)
+    away, nearest = KDTree(even).query(centres.reshape(-1, 2))
+    outwards = centres.reshape(-1, 2) - even[nearest]
+    normals = profile_normals(Profile(even, closed=False))[nearest]
+    depth = np.where(np.sum(outwards * normals, axis=-1) < 0.0, away, -away) - distance
+    shares = np.clip(0.5 + depth / (8.0 * cell), 0.0, 1.0).reshape(rows, columns)
+    if shares.max() < 0.6:
+        return None
+    found = outline(Section(shares, bottom, cell))
+    if found is None or found.closed:
+        return None
+    points = _even(found.points, _STEPS)
+    loop = np.concatenate([points, points[-2:0:-1] * [-1.0, 1.0]])
+    points = gaussian_filter1d(loop, _SMOOTHING, axis=0, mode="wrap")[: len(points)]
+    points[[0, -1], 0] = 0.0
+    return Profile(points, closed=False)
+
+
+def _even(points: Curve, count: int) -> Float[np.ndarray, "count 2"]:
+    """Returns a curve in even steps."""
+    length = _lengths(points)
+    ticks = np.linspace(0.0, length[-1], count)
+    return np.stack([np.interp(ticks, length, points[:, i]) for i in (0, 1)], axis=-1)
+
+
+def _lengths(points: Curve) -> Float[np.ndarray, " points"]:
+    steps = np.linalg.norm(np.diff(points, axis=0, prepend=points[:1]), axis=-1)
+    return np.cumsum(np.maximum(steps, np.append(0.0, np.full(len(points) - 1, 1e-9))))
+
+
+def _turn_right(along: np.ndarray) -> np.ndarray:
+    """Returns directions of the half-plane turned by a right angle, outwards from a profile."""
+    return np.stack([along[:, 1], -along[:, 0]], axis=1)
+
+
+def _below(
+    values: Float[np.ndarray, " n"],
+    limits: Float[np.ndarray, " n"],
+    width: Float[np.ndarray, " n"],
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Returns values that fade into limits, and their slopes; those by the limits are the rest."""
+    away = (limits - values) / width
+    return limits - width * np.logaddexp(0.0, away), 0.5 * (1.0 + np.tanh(0.5 * away))

@@ -1,0 +1,224 @@
+"""Vessels with liquid and air inside: their unknowns, and what light tells of them."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from refref_jax.geometry.triangle_meshes import volume
+from refref_jax.optics.interface_rules import NO_PARENT
+from refref_jax.reconstruct import ReconstructionError, gauss_newton, interior_looks, photometry
+from refref_jax.reconstruct.families import Revolution, fit_revolution
+from refref_jax.reconstruct.interior_looks import SearchSettings, hypotheses, look
+from refref_jax.reconstruct.interior_search import Few, Finding, select, unexplained
+from refref_jax.reconstruct.interiors import Detail, Interior, Vessel
+from refref_jax.reconstruct.mesh_distance import signed_distance
+from refref_jax.reconstruct.photometry import Backdrop, Photographs
+from refref_jax.reconstruct.revolution import Profile
+from refref_jax.reconstruct.walls import inset
+from refref_jax.render import backdrop, pixels
+from refref_jax.sampling.scene_bounds import Domain
+from tests.factories import lit_scenes, revolved
+from tests.laws import posed_surfaces
+
+_TINY = Detail(outer=40, inner=56, azimuths=12)
+_SMALL = Detail(outer=48, inner=64, azimuths=48)
+_FLASK = Interior(wall=0.12, level=-0.2, gap=0.1, tint=(0.5, 0.8, 0.95))
+_INTERIORS = {
+    each.name: each
+    for each in (
+        Interior("none"),
+        Interior("air", stained=True),
+        Interior("liquid"),
+        Interior("liquid and air", level=-0.2, gap=0.1),
+        Interior("air", mouth=True),
+        Interior("liquid and air", mouth=True, level=-0.2, gap=0.02),
+    )
+}
+
+
+@pytest.fixture(scope="module")
+def body():
+    """A bottle, 2.6 high."""
+    knee = revolved.arc((0.75, -1.15), 0.15, -90, 0)
+    neck = revolved.arc((0.35, 1.2), 0.1, 0, 90)
+    shoulder = [[0.9, -0.2], [0.85, 0.1], [0.7, 0.35], [0.52, 0.55], [0.45, 0.75]]
+    profile = np.concatenate([[[0.0, -1.3]], knee, shoulder, neck, [[0.0, 1.3]]])
+    return fit_revolution(revolved.revolve(revolved.even(profile, 160), azimuths=64))
+
+
+@pytest.fixture(scope="module", params=list(_INTERIORS))
+def vessel(request, body):
+    return Vessel(body, _INTERIORS[request.param], _TINY)
+
+
+class _Part:
+    """One part of a vessel as a surface that depends on unknowns."""
+
+    def __init__(self, vessel, number):
+        self.start, self.scales = vessel.start, vessel.scales
+        self.pose = lambda x: vessel.pose(x).parts[number]
+
+
+def _moved(vessel, seed, *, by=0.15):
+    scales = vessel.scales()
+    return vessel.start() + by * scales * np.random.default_rng(seed).normal(size=len(scales))
+
+
+def test_derivatives_are_central_differences(vessel):
+    for number in range(len(vessel.pose(vessel.start()).parts)):
+        posed_surfaces.assert_derivatives(_Part(vessel, number), step=1e-6, tolerance=1e-5)
+
+
+def test_the_prior_is_quadratic(vessel):
+    posed_surfaces.assert_prior(vessel)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_parts_are_closed_nested_and_apart(vessel, seed):
+    x = _moved(vessel, seed)
+    solids = vessel.solids(x)
+    for posed in vessel.pose(x).parts:
+        posed_surfaces.assert_closed(posed)
+    glass = solids[0]
+    assert glass.parent == NO_PARENT
+    outside = signed_distance(glass.mesh)
+    for each in solids[1:]:
+        assert each.parent == 0
+        assert outside(each.mesh.vertices).max() < 0.0
+    if len(solids) == 3:
+        liquid, air = (each.mesh.vertices @ vessel.body.axis.frame[:, 2] for each in solids[1:])
+        assert liquid.max() < air.min()
+
+
+def test_walls_never_cross_however_far_they_move(body):
+    vessel = Vessel(body, Interior("air", wall=0.1), _TINY)
+    for offset in (-3.0, 3.0):
+        x = vessel.start()
+        x[vessel.layout.inner] = offset
+        glass, air = vessel.solids(x)
+        assert signed_distance(glass.mesh)(air.mesh.vertices).max() < 0.0
+        assert volume(air.mesh.vertices, air.mesh.faces) > 0.0
+
+
+def test_the_number_of_faces_does_not_depend_on_the_level(body):
+    counts = {
+        sum(len(part.faces) for part in vessel.pose(vessel.start()).parts)
+        for level in (-1.0, -0.3, 0.4, 1.0)
+        for vessel in [Vessel(body, dataclasses.replace(_FLASK, level=level), _TINY)]
+    }
+    assert len(counts) == 1
+
+
+def test_levels_are_horizontal_where_they_should_be(body):
+    vessel = Vessel(body, _FLASK, _TINY)
+    _, liquid, air = vessel.solids(vessel.start())
+    up, height = vessel.body.axis.frame[:, 2], vessel.body.axis.point[2]
+    assert (liquid.mesh.vertices @ up).max() == pytest.approx(height - 0.2, abs=1e-6)
+    assert (air.mesh.vertices @ up).min() == pytest.approx(height - 0.1, abs=1e-6)
+    assert (liquid.name, liquid.index, liquid.tint) == ("liquid", 1.36, (0.5, 0.8, 0.95))
+
+
+def test_an_inset_of_a_cylinder_is_a_smaller_one():
+    found = inset(Profile(revolved.even(revolved.cylinder(), 200), closed=False), 0.3, 2.0)
+    assert found.points[:, 0].max() == pytest.approx(0.7, abs=2e-3)
+    assert found.points[:, 1].max() == pytest.approx(0.7, abs=2e-3)
+    assert np.all(np.diff(found.points[:, 1]) > -2e-3)
+    assert inset(Profile(revolved.cylinder(), closed=False), 1.2, 2.0) is None
+
+
+def test_what_can_not_be_a_vessel_is_refused(body):
+    with pytest.raises(ReconstructionError, match="thinner"):
+        Vessel(body, Interior("air", wall=1.0), _TINY)
+    ring = Revolution(body.axis, Profile(revolved.ring(), closed=True), 2.0)
+    with pytest.raises(ReconstructionError, match="ring"):
+        Vessel(ring, Interior("air"), _TINY)
+
+
+def test_hypotheses_begin_with_the_simplest(body):
+    found = hypotheses(body, SearchSettings(levels=3, walls=(0.05, 0.1)))
+    names = list(dict.fromkeys(each.name for each in found))
+    assert names == ["none", "air", "liquid", "liquid and air"]
+    assert [sum(each.name == name for each in found) for name in names] == [1, 2, 2, 6]
+    counts = [len(Vessel(body, each, _TINY).start()) for each in found]
+    assert counts == sorted(counts)
+
+
+def test_only_large_errors_call_for_a_search():
+    assert unexplained(0.15, 0.02)
+    assert not unexplained(0.03, 0.02)
+
+
+@pytest.fixture(scope="module")
+def surface():
+    """A sphere of smooth random radiance."""
+    side, random = 32, np.random.default_rng(0)
+    pyramid = backdrop.init(side, radiance=0.4)
+    levels = [
+        jnp.asarray(level + size * random.normal(size=level.shape), jnp.float32)
+        for level, size in zip(pyramid, (0.12, 0.12, 0.08, 0.04), strict=True)
+    ]
+    mips = backdrop.mipmap(tuple(jnp.maximum(level, -0.1) for level in levels), "bounded")
+    return Backdrop(Domain(8.0, "bounded"), mips, tuple(jnp.ones_like(mip) for mip in mips))
+
+
+@pytest.fixture(scope="module")
+def small_tiles():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(photometry, "_TILE", 1024)
+        yield
+
+
+@pytest.fixture(scope="module")
+def photographs(body, surface, small_tiles):
+    """Pixels of the flask, without noise."""
+    del small_tiles
+    rays, views = lit_scenes.pixels(1024, reach=0.6)
+    vessel = Vessel(body, _FLASK, _SMALL)
+    seen = photometry.predict(gauss_newton.body_of(vessel.pose(vessel.start())), surface, rays)
+    rgb = np.asarray(jnp.clip(pixels.linear_to_srgb(jnp.asarray(seen.linear)), 0.0, 1.0))
+    return Photographs(jax.device_get(rays), rgb.astype(np.float64), views)
+
+
+def test_a_look_finds_the_tint_and_prefers_the_truth(body, surface, photographs):
+    clear = dataclasses.replace(_FLASK, tint=(1.0, 1.0, 1.0))
+    others = (dataclasses.replace(clear, level=0.3), Interior("liquid", wall=0.12))
+    best, *worse = (look(body, at, surface, photographs, _SMALL) for at in (clear, *others))
+    assert best.interior.tint == pytest.approx(_FLASK.tint, abs=0.03)
+    assert best.error < 0.01
+    assert all(each.error > 2.0 * best.error for each in worse)
+
+
+def test_level_index_and_tint_are_recovered(body, surface, photographs):
+    start = dataclasses.replace(_FLASK, level=-0.16, gap=0.08, liquid=1.345, tint=(0.6, 0.8, 0.9))
+    vessel = Vessel(body, start, _SMALL)
+    layout = vessel.layout
+    few = Few(vessel, vessel.start(), np.eye(layout.count)[:, layout.inner.stop :])
+    steps = gauss_newton.Steps((2, 1, 1, 0, 0, 0, 0, 0), 1024, 1024)
+    fit = gauss_newton.fit(few, few.start(), surface, photographs, settings=steps)
+    found = vessel.interior(few.whole(fit.x))
+    assert found.level == pytest.approx(_FLASK.level, abs=0.005)
+    assert found.gap == pytest.approx(_FLASK.gap, abs=0.01)
+    assert found.liquid == pytest.approx(1.36, abs=0.003)
+    assert found.glass == pytest.approx(1.5, abs=0.003)
+    assert found.tint == pytest.approx(_FLASK.tint, abs=0.02)
+
+
+def test_the_simplest_of_equally_good_findings_is_kept(body, surface, photographs):
+    def finding(interior):
+        vessel = Vessel(body, interior, _SMALL)
+        x = vessel.start()
+        return Finding(vessel, x, np.eye(len(x)), 0.0)
+
+    simple, stained = finding(_FLASK), finding(dataclasses.replace(_FLASK, stained=True))
+    wrong = finding(Interior("liquid", wall=0.12))
+    assert select([wrong, simple, stained], surface, photographs) is simple
+
+
+def test_looks_leave_out_walls_that_fill_the_vessel(body, surface, photographs):
+    settings = SearchSettings((0.05, 0.4), 1, (0.04,), (1.36,), mouths=(False,))
+    found = interior_looks.looks_at_all(body, surface, photographs, settings)
+    assert [each.error for each in found] == sorted(each.error for each in found)
+    assert all(each.interior.wall == pytest.approx(0.13, abs=0.01) for each in found)
