@@ -38,7 +38,7 @@ from refref_jax.reconstruct import ReconstructionError, photometry
 from refref_jax.reconstruct.photometry import Backdrop, Body, Photographs
 from refref_jax.reconstruct.shapes import Posed
 
-Matrix = Float[np.ndarray, "rows unknowns"] | scipy.sparse.csr_array
+Matrix = Float[np.ndarray, "_ _"] | scipy.sparse.csr_array
 """A matrix of derivatives, dense or sparse."""
 
 # Errors of pixels beyond this, in sRGB, do not grow in the robust error.
@@ -351,8 +351,8 @@ def _covariance(
 def _by_unknowns(candidate: Candidate, body: Body, found: photometry.Sensitivities) -> Matrix:
     """Returns the derivatives of the coordinates of all rays by the unknowns, ray-major."""
     parts = candidate.parts
-    first = np.cumsum([0] + [len(part.vertices) for part in parts])
-    first_normal = np.cumsum([0] + [len(part.normals) for part in parts])
+    first = np.cumsum([0] + [len(part.vertices) for part in parts]).tolist()
+    first_normal = np.cumsum([0] + [len(part.normals) for part in parts]).tolist()
     vertices = np.concatenate([p.faces + n for p, n in zip(parts, first, strict=False)])
     normals = np.concatenate([p.normal_ids + n for p, n in zip(parts, first_normal, strict=False)])
     ray, bend = np.nonzero(found.primitives != NO_PRIMITIVE)
@@ -392,7 +392,7 @@ def _stacked(matrices: Sequence[Matrix]) -> Matrix:
     return np.concatenate(matrices)
 
 
-def _block_diagonal(blocks: Float[np.ndarray, "rays 3 3"]) -> scipy.sparse.bsr_array:
+def _block_diagonal(blocks: Float[np.ndarray, "rays 3 3"]) -> scipy.sparse.csr_array:
     count = len(blocks)
     data = (blocks.astype(np.float64), np.arange(count), np.arange(count + 1))
     return scipy.sparse.bsr_array(data, shape=(3 * count, 3 * count)).tocsr()

@@ -44,7 +44,8 @@ from refref_jax.sampling.scene_bounds import Domain
 MAIN = PathSettings(max_bends=8, reflections="all", min_throughput=TREE.min_throughput)
 """The main path: 8 bends are enough for 99 % of the pixels of a torus or of a filled flask."""
 
-# Number of rays traced at once (the same for any number of rays: one compilation), and largest number of taps along each axis of a footprint.
+# Number of rays traced at once (the same for any number of rays: one compilation), and largest
+# number of taps along each axis of a footprint.
 _TILE = 8192
 _TAPS = 3
 
@@ -289,7 +290,7 @@ def _differentiate(
     radiance = backdrop.radiance(mips, lookups)
     met = primitives[:, :-1] != NO_PRIMITIVE
     kinds = jnp.arange(indices.shape[0], dtype=jnp.int32)
-    crossings = jnp.sum((parts[:, :-1, None] == kinds) & met[..., None], axis=1, dtype=jnp.int32)
+    crossings = jnp.sum((parts[:, :-1, None] == kinds[None, None]) & met[..., None], axis=1, dtype=jnp.int32)
     cut = lambda x: x[:, :, :-1]  # noqa: E731 - the last cast meets nothing
     found = Sensitivities(
         primitives=primitives[:, :-1],
@@ -351,7 +352,7 @@ def _slopes(mips: Mips, lookups: Lookups) -> Float[Array, "rays 2 3"]:
     def along(axis: int) -> Float[Array, "rays 3"]:
         shift = _HALF_WIDTH * jnp.eye(2, dtype=lookups.starts.dtype)[axis]
         there, here = (
-            backdrop.radiance(mips, lookups._replace(starts=lookups.starts + sign * shift))
+            backdrop.radiance(mips, lookups._replace(starts=lookups.starts + sign * shift[None]))
             for sign in (1.0, -1.0)
         )
         # A face is two units and as many cells wide as it has sides.
