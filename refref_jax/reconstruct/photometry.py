@@ -44,7 +44,8 @@ from refref_jax.sampling.scene_bounds import Domain
 MAIN = PathSettings(max_bends=8, reflections="all", min_throughput=TREE.min_throughput)
 """The main path: 8 bends are enough for 99 % of the pixels of a torus or of a filled flask."""
 
-# Number of rays traced at once (the same for any number of rays: one compilation), and largest number of taps along each axis of a footprint.
+# Number of rays traced at once (the same for any number of rays: one compilation), and largest
+# number of taps along each axis of a footprint.
 _TILE = 8192
 _TAPS = 3
 

@@ -103,7 +103,7 @@ class SingleObject:
         if self.tinted:
             by_tint[:, -3:] = np.eye(3)
             tint = np.exp(x[-3:])
-        interfaces = nested([self.index_of(x)], [NO_PARENT], tints=tint[None])
+        interfaces = nested([self.index_of(x)], [NO_PARENT], tints=[tint.tolist()])
         derivatives = (scipy.sparse.csr_array(each) for each in (by_index, by_tint))
         index, tints = derivatives
         return Candidate((padded,), interfaces, index, tints if self.tinted else tints[:0])

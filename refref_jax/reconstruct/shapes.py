@@ -84,7 +84,6 @@ class Posed(NamedTuple):
 
 
 @runtime_checkable
-@runtime_checkable
 class Shape(Protocol):
     """A closed surface that depends on unknowns."""
 
