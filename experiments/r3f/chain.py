@@ -5,6 +5,7 @@ import hashlib
 import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import NoReturn
 
 from experiments.r3f import geometry_stage, index_stage, light_stage, object_source, records, report
 from experiments.r3f.records import IndexFacts, LightFacts, Reconstruction, ReconstructionConfig
@@ -143,7 +144,7 @@ def bounds_of(
 def describe_index(index: IndexFacts) -> str:
     """Returns a one-line description of the index."""
     if index.error is None:
-        return f"index of refraction: {index.index:g} ({index.source})"
+        return f"index of refraction: {index.index:.6g} ({index.source})"
     return f"index of refraction: {index.index:.4f} +- {index.error:.4f} ({index.source})"
 
 
@@ -164,11 +165,17 @@ def _index(scene: Path, out: Path, found: Reconstruction) -> IndexFacts:
         centre=config.centre,
     )
     if not math.isfinite(estimate.deviation):
-        raise ValueError(
-            f"The index of refraction was estimated as {estimate.index:.3f}, but the error does "
-            f"not depend on it (see {folder}). Set it explicitly, as in --ior=1.5."
-        )
+        if config.refinement == "light":  # which may find out that the object is not solid
+            return IndexFacts("estimated", estimate.index, None, estimate.error)
+        _refuse_index(out, estimate.index)
     return IndexFacts("estimated", estimate.index, estimate.deviation, estimate.error)
+
+
+def _refuse_index(out: Path, index: float) -> NoReturn:
+    raise ValueError(
+        f"The index of refraction was estimated as {index:.3f}, but the error does not depend on "
+        f"it (see {out / _INDEX_FOLDER}). Set it explicitly, as in --ior=1.5."
+    )
 
 
 def _refined(scene: Path, out: Path, found: Reconstruction, say: Say) -> Reconstruction:
@@ -180,6 +187,9 @@ def _refined(scene: Path, out: Path, found: Reconstruction, say: Say) -> Reconst
         records.write(out, found)
     if found.light is not None:
         say(_describe_light(found.light))
+    if found.index.source == "estimated" and found.index.error is None:
+        if found.light is None or not found.light.kept:
+            _refuse_index(out, found.index.index)
     return found
 
 

@@ -3,12 +3,15 @@
     {out}/light/{object}_{material}.ply    the refined surface, if it was kept
     {out}/light/errors.png                 pixels before and after, and the uncertainty of normals
 
-Families of shapes and a free surface are fitted to pixels of the training views, together with the
-index (`reconstruct.shape_from_refraction`). Pixels that were not fitted judge them: those of the
+If the object is a body of revolution, and solid glass explains its pixels badly, the stage first
+looks at what may be inside (`reconstruct.interior_search`); a vessel becomes several parts. Else
+families of shapes and a free surface are fitted to pixels of the training views, together with the
+index (`reconstruct.shape_from_refraction`). Pixels that were not fitted judge: those of the
 validation views, or of every eighth training view where these have no masks. Where the background
 is a field, and where light explains nothing better, the surface stays as it is.
 """
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -20,7 +23,7 @@ from scipy.spatial import KDTree
 from experiments.cli.progress import ProgressBar
 from experiments.figures.style import pyplot
 from experiments.r3f import index_stage
-from experiments.r3f.records import IndexFacts, LightFacts, TrialFacts
+from experiments.r3f.records import IndexFacts, LightFacts, PartFacts, TrialFacts
 from refref_jax import atomic_files
 from refref_jax.choices import Split
 from refref_jax.data import meshes, scene_folder
@@ -28,12 +31,25 @@ from refref_jax.data.scene_folder import Frames
 from refref_jax.geometry.cameras import image_rays
 from refref_jax.geometry.surfaces import pack_meshes
 from refref_jax.geometry.triangle_meshes import Mesh
-from refref_jax.reconstruct import gauss_newton, photometry, shape_from_refraction
+from refref_jax.reconstruct import (
+    families,
+    gauss_newton,
+    interior_looks,
+    interior_search,
+    model_selection,
+    photometry,
+    shape_from_refraction,
+)
+from refref_jax.reconstruct.gauss_newton import Fit
+from refref_jax.reconstruct.interior_looks import SearchSettings
+from refref_jax.reconstruct.interiors import Solid, Vessel
 from refref_jax.reconstruct.masks import Views
+from refref_jax.reconstruct.model_selection import Trial, judged
 from refref_jax.reconstruct.outlines import Outlines
 from refref_jax.reconstruct.photometry import Backdrop, Photographs
 from refref_jax.reconstruct.refinement import objection
-from refref_jax.reconstruct.shape_from_refraction import Trial
+from refref_jax.reconstruct.shape_from_refraction import SingleObject
+from refref_jax.reconstruct.shapes import FixedShape
 from refref_jax.render.images import find_first_surface
 
 FOLDER = "light"
@@ -42,6 +58,15 @@ FIGURE = "errors.png"
 
 # Number of pixels that judge, and one training view in this many, if there are no others.
 _JUDGES, _ONE_IN = 16_384, 8
+
+# Error of pixels through solid glass above which something may be inside, sRGB, and largest rms
+# distance of the surface from a body of revolution, as a share of its diameter.
+_UNEXPLAINED, _FURTHEST = 0.05, 0.03
+
+# Materials that name the files of parts, with their indices.
+_MATERIALS = [
+    (name, meshes.INDEX_OF_REFRACTION[name]) for name in ("glass", "water", "alcohol", "air")
+]
 
 # Share of the volume that the refinement may change: it corrects normals, not outlines.
 _VOLUME_CHANGE = 0.02
@@ -85,29 +110,44 @@ def run(
         return LightFacts(kept=False, index=known.index, remark=reason)
     seen = read(scene, seed=seed)
     trials = fit(scene, mesh, known, surface, seen, seed=seed)
-    masks, chosen = trials[0], shape_from_refraction.choose(trials)
+    masks, chosen = trials[0], model_selection.choose(trials)
     remark = "" if chosen is not masks else "no shape explains the judges significantly better"
     if not remark and (complaint := objection(mesh, chosen.mesh, _VOLUME_CHANGE)):
         chosen, remark = masks, f"the {chosen.name} was rejected: {complaint}"
     kept = chosen is not masks
-    deviations = shape_from_refraction.normal_deviations(chosen)
+    deviations = model_selection.normal_deviations(chosen)
+    parts: tuple[PartFacts, ...] = ()
     with atomic_files.written_folder(target.parent) as folder:
-        if kept:
+        if kept and isinstance(chosen.model, Vessel):
+            parts = _write_parts(folder, target.stem, chosen.model.solids(chosen.fit.x))
+        elif kept:
             meshes.write_mesh(folder / target.name, *chosen.mesh)
         draw(folder / FIGURE, scene, seen.split, masks, chosen, surface, deviations)
     unknown = float(np.mean(deviations > _UNKNOWN)) if kept else 1.0
     return LightFacts(
         kept=kept,
-        index=chosen.index if known.source == "estimated" else known.index,
+        index=chosen.outer_index if known.source == "estimated" else known.index,
         shape=chosen.name,
         before=masks.error,
         after=chosen.error,
-        deviation=index_deviation(chosen) if kept else None,
+        deviation=chosen.index_deviation if kept else None,
         undetermined=unknown,
         split=seen.split,
         remark=remark,
         trials=tuple(_facts(trial, min(trials, key=lambda each: each.error)) for trial in trials),
+        parts=parts,
     )
+
+
+def _write_parts(folder: Path, stem: str, solids: Sequence[Solid]) -> tuple[PartFacts, ...]:
+    """Writes the parts of a vessel; their files are named after materials of nearly their index."""
+    facts, name = [], stem.rsplit("_", 1)[0]
+    for solid in solids:
+        material = min(_MATERIALS, key=lambda each: abs(each[1] - solid.index))[0]
+        file = f"{name}_{solid.name}_{material}.ply"
+        meshes.write_mesh(folder / file, *solid.mesh)
+        facts.append(PartFacts(file, solid.index, solid.tint))
+    return tuple(facts)
 
 
 def read(scene: Path, *, seed: int) -> Seen:
@@ -130,9 +170,23 @@ def read(scene: Path, *, seed: int) -> Seen:
 def fit(
     scene: Path, mesh: Mesh, known: IndexFacts, surface: Backdrop, seen: Seen, *, seed: int
 ) -> tuple[Trial, ...]:
-    """Fits all shapes that come near the mesh; see `shape_from_refraction.fit_shapes`."""
+    """Fits vessels, or else all shapes that come near the mesh; the mesh itself comes first.
+
+    Args:
+      scene: folder of the scene.
+      mesh: mesh from masks.
+      known: index of refraction.
+      surface: backdrop.
+      seen: pixels to fit, and those that judge.
+      seed: random seed.
+    """
     frames = scene_folder.read_frames(scene, "train")
     outlines = Outlines(Views(scene_folder.read_masks(frames), frames.cameras), seed=seed)
+    solid = SingleObject(FixedShape(mesh), known.index)
+    masks = judged("masks", solid, Fit(solid.start(), np.zeros((1, 1)), ()), surface, seen.judges)
+    vessels = _vessels(masks, mesh, surface, seen, outlines, seed=seed)
+    if vessels and model_selection.choose([masks, *vessels]) is not masks:
+        return (masks, *vessels)
     options = {} if known.source == "estimated" else {"deviation": 0.0}
     with ProgressBar("light", 100) as bar:
         return shape_from_refraction.fit_shapes(
@@ -148,21 +202,63 @@ def fit(
         )
 
 
-def index_deviation(trial: Trial) -> float:
-    """Returns the standard deviation of the index of refraction."""
-    return float(np.sqrt(max(trial.index_variance, 0.0)))
+def _vessels(
+    masks: Trial,
+    mesh: Mesh,
+    surface: Backdrop,
+    seen: Seen,
+    outlines: Outlines,
+    *,
+    seed: int,
+) -> list[Trial]:
+    """Returns vessels that were fitted; none if solid glass may explain the pixels.
+
+    The looks at hypotheses decide: if solid glass is the best of them, there is no vessel.
+    """
+    body = families.fit_revolution(mesh, furthest=_FURTHEST)
+    if masks.error < _UNEXPLAINED or body is None or body.closed:
+        return []
+    settings = SearchSettings(seed=seed)
+    with ProgressBar("inside", 100) as bar:
+        bar.show(0, "looking at hypotheses")
+        looks = interior_looks.looks_at_all(body, surface, seen.fitted, settings)
+        if looks[0].interior.contents == "none":
+            bar.show(100, "solid glass")
+            return []
+        count = itertools.count(10, 8)
+        found = interior_search.search(
+            body,
+            surface,
+            seen.fitted,
+            seen.judges,
+            settings=settings,
+            outlines=outlines,
+            looks=looks,
+            progress=lambda line: bar.show(min(next(count), 99), line),
+        )
+        bar.show(100, f"vessel: {found.best.vessel.interior_at_start.name}")
+    return [
+        judged(
+            f"vessel: {each.vessel.interior_at_start.name}",
+            each.vessel,
+            Fit(each.x, each.covariance, ()),
+            surface,
+            seen.judges,
+        )
+        for each in found.findings
+    ]
 
 
 def _facts(trial: Trial, best: Trial) -> TrialFacts:
-    worse = shape_from_refraction.compare(trial, best)
+    worse = model_selection.compare(trial, best)
     return TrialFacts(
         trial.name,
         len(trial.fit.x),
         trial.error,
         worse.mean,
         worse.error,
-        trial.index,
-        index_deviation(trial),
+        trial.outer_index,
+        trial.index_deviation,
         trial.fit.taken,
     )
 

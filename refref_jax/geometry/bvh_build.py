@@ -274,10 +274,10 @@ def filled_up(bvh: BVH) -> BVH:
     The trees of a mesh that moves differ in size: with round numbers, programs that were compiled
     for one of them serve all.
     """
-    tables = _filled(bvh.nodes, axis=1)
+    tables = _filled(np.asarray(bvh.nodes), axis=1)
     added = np.arange(bvh_nodes.OCTANTS)[:, None] * (tables.shape[1] - bvh.nodes.shape[1])
     tables[:, : bvh.nodes.shape[1] - 1, 6] += added.astype(np.int32)  # skip pointers count rows
-    triangles, facets = _filled(bvh.triangles), _filled(bvh.facets)
+    triangles, facets = (_filled(np.asarray(each)) for each in (bvh.triangles, bvh.facets))
     return BVH(host_array(tables), host_array(triangles), host_array(facets))
 
 

@@ -147,6 +147,7 @@ def search(
     settings: SearchSettings | None = None,
     detail: Detail = FINE,
     outlines: Callable[[Candidate], Rows] | None = None,
+    looks: list[Look] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Found:
     """Finds what is inside a vessel.
@@ -159,6 +160,7 @@ def search(
       settings: settings of the search.
       detail: resolution of the meshes of the last fit.
       outlines: equations of the masks' outlines, for the last fit.
+      looks: looks at all hypotheses, if there are any yet (`looks_at_all`).
       progress: called with a line about each fit.
 
     Raises:
@@ -167,7 +169,7 @@ def search(
     if not len(pixels.views) or not len(judges.views):
         raise ReconstructionError("No pixel sees the object. Check the masks and the cameras.")
     settings, say = settings or SearchSettings(), progress or (lambda line: None)
-    looks = looks_at_all(body, surface, pixels, settings)
+    looks = looks or looks_at_all(body, surface, pixels, settings)
     say(f"{len(looks)} looks; best: {looks[0].interior.name}, error {looks[0].error:.4f}")
     rough = []
     for found in finalists(looks, settings):

@@ -1,8 +1,8 @@
 """Compares photographs with the light of a known backdrop, refracted by an object of unknown shape.
 
 `predict` renders pixels along the whole path tree. `sensitivities` differentiates them: the main
-path of a pixel (refracted wherever it can be) carries the share `T` of its light and ends at a place
-`(u, v)` of the backdrop. With the three *coordinates* `(u, v, T)`,
+path of a pixel (refracted wherever it can be) carries the share `T` of its light and ends at a
+place `(u, v)` of the backdrop. With the three *coordinates* `(u, v, T)`,
 
     d colour / d unknowns = (d colour / d coordinates) (d coordinates / d unknowns).
 

@@ -7,8 +7,7 @@ explains held-out pixels not significantly worse than the best.
 Source: ours; the paper (arXiv 2505.05848) smooths by hand, and trains the index with the field.
 """
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -18,10 +17,11 @@ from trimesh import Trimesh
 from trimesh.remesh import subdivide_to_size
 
 from refref_jax.geometry.triangle_meshes import Mesh, diameter, make_mesh
-from refref_jax.optics.media import INDEX_OF_AIR
 from refref_jax.optics.interface_rules import NO_PARENT, nested
+from refref_jax.optics.media import INDEX_OF_AIR
 from refref_jax.reconstruct import ReconstructionError, families, gauss_newton, photometry
 from refref_jax.reconstruct.gauss_newton import Candidate, Fit, Matrix, Rows, StepFacts, Steps
+from refref_jax.reconstruct.model_selection import Trial, judged
 from refref_jax.reconstruct.photometry import Backdrop, Body, Photographs
 from refref_jax.reconstruct.refractive_index import (
     Descent,
@@ -35,6 +35,8 @@ from refref_jax.reconstruct.shapes import FixedShape, FreeSurface, Posed, Shape,
 from refref_jax.reconstruct.smoothing import diffuse
 
 Outlines = Callable[[Candidate], Rows]
+
+_USUAL_SEARCH = IndexSearch(descents=2)
 
 # Standard deviation of the prior of an index that was found for the mesh from masks, and largest
 # change in one step.
@@ -108,11 +110,6 @@ class SingleObject:
         index, tints = derivatives
         return Candidate((padded,), interfaces, index, tints if self.tinted else tints[:0])
 
-    @property
-    def index_at(self) -> int:
-        """Place of the index among the unknowns, from the end."""
-        return -self._extra
-
     def index_of(self, x: Float[np.ndarray, " unknowns"]) -> float:
         """Returns the index of refraction."""
         return float(x[-self._extra])
@@ -153,7 +150,7 @@ def find_index(
     surface: Backdrop,
     pixels: Photographs,
     *,
-    search: IndexSearch = IndexSearch(),
+    search: IndexSearch = _USUAL_SEARCH,
     start: float | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
     seed: int = 0,
@@ -254,43 +251,6 @@ def _spread(every: int, count: int, seed: int) -> Int[np.ndarray, " some"]:
     return np.random.default_rng((seed, count)).choice(every, min(every, count), replace=False)
 
 
-class Trial(NamedTuple):
-    """One model, fitted.
-
-    Attributes:
-      name: kind of its shape.
-      model: the model.
-      fit: its unknowns, their covariance, and what the steps did.
-      by_view: mean robust error of the judges of each view, sRGB.
-    """
-
-    name: str
-    model: SingleObject
-    fit: Fit
-    by_view: Float[np.ndarray, " views"]
-
-    @property
-    def error(self) -> float:
-        """Mean error of the judges."""
-        return float(self.by_view.mean())
-
-    @property
-    def index(self) -> float:
-        """Index of refraction."""
-        return self.model.index_of(self.fit.x)
-
-    @property
-    def index_variance(self) -> float:
-        """Variance of the index of refraction."""
-        at = self.model.index_at
-        return float(self.fit.covariance[at, at])
-
-    @property
-    def mesh(self) -> Mesh:
-        """The surface."""
-        return self.model.mesh(self.fit.x)
-
-
 def fit_shapes(
     mesh: Mesh,
     index: float,
@@ -383,14 +343,14 @@ class _Task(NamedTuple):
 
     def judged(self, name: str, model: SingleObject, fit: Fit) -> Trial:
         """Returns a fitted model with the errors of the judges."""
-        return Trial(name, model, fit, _by_view(model.pose(fit.x), self.surface, self.judges))
+        return judged(name, model, fit, self.surface, self.judges)
 
 
 def _fit_free(
     task: _Task, start: Trial, blur: int, progress: Callable[[int, StepFacts], None]
 ) -> Trial:
     """Fits a free surface, from the mesh of masks or from a family."""
-    mesh, index, done = _with_many_vertices(start.mesh), start.index, 0
+    mesh, index, done = _with_many_vertices(start.mesh), start.outer_index, 0
     smoothings = _SMOOTHINGS if start.name == "masks" else (0.0,)
     for number, smoothing in enumerate(smoothings):
         if smoothing:
@@ -418,45 +378,6 @@ def _with_many_vertices(mesh: Mesh) -> Mesh:
     return make_mesh(np.asarray(found.vertices), np.asarray(found.faces, np.int64))
 
 
-def _by_view(
-    candidate: Candidate, surface: Backdrop, judges: Photographs
-) -> Float[np.ndarray, " views"]:
-    """Returns the mean error of each view that has judges."""
-    errors = gauss_newton.errors_of(gauss_newton.body_of(candidate), surface, judges)
-    _, views = np.unique(judges.views, return_inverse=True)
-    return np.bincount(views, errors) / np.bincount(views)
-
-
-class Comparison(NamedTuple):
-    """How much worse one trial is than another.
-
-    Attributes:
-      mean: mean difference of the errors of views, sRGB.
-      error: standard error of the mean.
-    """
-
-    mean: float
-    error: float
-
-
-def compare(trial: Trial, best: Trial) -> Comparison:
-    """Returns how much worse a trial is than the best, by the judges of each view."""
-    difference = trial.by_view - best.by_view
-    count = len(difference)
-    error = float(difference.std(ddof=1)) / math.sqrt(count) if count > 1 else 0.0
-    return Comparison(float(difference.mean()), error)
-
-
-def choose(trials: Sequence[Trial]) -> Trial:
-    """Returns the trial of fewest unknowns that is not worse than the best by two standard errors."""
-    best = min(trials, key=lambda trial: trial.error)
-    for trial in sorted(trials, key=lambda trial: len(trial.fit.x)):
-        worse = compare(trial, best)
-        if worse.mean <= 2.0 * worse.error:
-            return trial
-    return best
-
-
 def first_blur(candidate: Candidate, surface: Backdrop, pixels: Photographs) -> int:
     """Returns the least blur of the backdrop at which steps find their way, in halvings.
 
@@ -473,15 +394,3 @@ def first_blur(candidate: Candidate, surface: Backdrop, pixels: Photographs) -> 
         if error <= _ENOUGH * added:
             return halvings - 1 if halvings == 1 else halvings
     return most
-
-
-def normal_deviations(
-    trial: Trial,
-) -> Float[np.ndarray, " normals"]:
-    """Returns the standard deviation of each normal of the shape, in degrees."""
-    posed = trial.model.pose(trial.fit.x).parts[0]
-    spread = posed.by_normals @ trial.fit.covariance
-    by = posed.by_normals
-    both = by.multiply(spread) if scipy.sparse.issparse(by) else by * spread
-    variance = np.asarray(both.sum(axis=1)).reshape(-1, 3).sum(axis=1)
-    return np.degrees(np.sqrt(np.maximum(variance, 0.0)))

@@ -1,0 +1,125 @@
+"""Which of several fitted models to keep: the smallest one that held-out pixels do not refuse.
+
+A `Trial` is a model that was fitted, with the errors of pixels that it was not fitted to. Errors of
+one view are alike, so views are what is counted: one trial is worse than another if the mean of the
+differences of their views' errors is above two standard errors.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse
+from jaxtyping import Float
+
+from refref_jax.geometry.triangle_meshes import Mesh
+from refref_jax.reconstruct import gauss_newton
+from refref_jax.reconstruct.gauss_newton import Candidate, Fit, Model
+from refref_jax.reconstruct.photometry import Backdrop, Photographs
+from refref_jax.reconstruct.shapes import mesh_of
+
+# Standard errors by which a trial must be worse than the best to lose.
+_WORSE = 2.0
+
+
+class Trial(NamedTuple):
+    """One model, fitted.
+
+    Attributes:
+      name: what it is, in words.
+      model: the model.
+      fit: its unknowns, their covariance, and what the steps did.
+      by_view: mean robust error of the judges of each view, sRGB.
+    """
+
+    name: str
+    model: Model
+    fit: Fit
+    by_view: Float[np.ndarray, " views"]
+
+    @property
+    def error(self) -> float:
+        """Mean error of the judges."""
+        return float(self.by_view.mean())
+
+    @property
+    def candidate(self) -> Candidate:
+        """The scene at the fitted unknowns."""
+        return self.model.pose(self.fit.x)
+
+    @property
+    def outer_index(self) -> float:
+        """Index of refraction of the outermost part."""
+        return float(np.asarray(self.candidate.interfaces.index_inside)[0])
+
+    @property
+    def index_deviation(self) -> float:
+        """Standard deviation of this index."""
+        by = self.candidate.by_indices
+        row = (by.toarray() if scipy.sparse.issparse(by) else np.asarray(by))[0]
+        return math.sqrt(max(float(row @ self.fit.covariance @ row), 0.0))
+
+    @property
+    def mesh(self) -> Mesh:
+        """Surface of the outermost part."""
+        return mesh_of(self.candidate.parts[0])
+
+
+def judged(name: str, model: Model, fit: Fit, surface: Backdrop, judges: Photographs) -> Trial:
+    """Returns a fitted model with the errors of the judges.
+
+    Args:
+      name: what the model is, in words.
+      model: the model.
+      fit: its unknowns.
+      surface: backdrop.
+      judges: pixels that it was not fitted to.
+    """
+    body = gauss_newton.body_of(model.pose(fit.x))
+    errors = gauss_newton.errors_of(body, surface, judges)
+    _, views = np.unique(judges.views, return_inverse=True)
+    return Trial(name, model, fit, np.bincount(views, errors) / np.bincount(views))
+
+
+class Comparison(NamedTuple):
+    """How much worse one trial is than another.
+
+    Attributes:
+      mean: mean difference of the errors of views, sRGB.
+      error: standard error of the mean.
+    """
+
+    mean: float
+    error: float
+
+
+def compare(trial: Trial, best: Trial) -> Comparison:
+    """Returns how much worse a trial is than the best, by the judges of each view."""
+    difference = trial.by_view - best.by_view
+    count = len(difference)
+    error = float(difference.std(ddof=1)) / math.sqrt(count) if count > 1 else 0.0
+    return Comparison(float(difference.mean()), error)
+
+
+def choose(trials: Sequence[Trial]) -> Trial:
+    """Returns the trial of fewest unknowns that is not worse than the best by two standard errors.
+
+    Args:
+      trials: one or more trials.
+    """
+    best = min(trials, key=lambda trial: trial.error)
+    for trial in sorted(trials, key=lambda trial: len(trial.fit.x)):
+        worse = compare(trial, best)
+        if worse.mean <= _WORSE * worse.error:
+            return trial
+    return best
+
+
+def normal_deviations(trial: Trial) -> Float[np.ndarray, " normals"]:
+    """Returns the standard deviation of each normal of the outermost part, in degrees."""
+    by = trial.candidate.parts[0].by_normals
+    spread = by @ trial.fit.covariance
+    both = by.multiply(spread) if scipy.sparse.issparse(by) else np.asarray(by) * spread
+    variance = np.asarray(both.sum(axis=1)).reshape(-1, 3).sum(axis=1)
+    return np.degrees(np.sqrt(np.maximum(variance, 0.0)))
