@@ -16,8 +16,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from refref_jax.reconstruct import ReconstructionError, gauss_newton, photometry
+from refref_jax.reconstruct.contents import COARSE, Contents, Detail, Interior
 from refref_jax.reconstruct.families import Revolution
-from refref_jax.reconstruct.interiors import COARSE, Contents, Detail, Interior, Vessel
+from refref_jax.reconstruct.interiors import Vessel
 from refref_jax.reconstruct.photometry import Backdrop, Photographs
 
 # Errors of a channel beyond this, in sRGB, do not grow while a tint is found.
@@ -43,7 +44,8 @@ class SearchSettings:
       pixels: number of pixels of a look.
       finalists: number of hypotheses of each kind that are improved.
       few: blurs of the steps of the few numbers of a hypothesis.
-      all: blurs of the steps of all unknowns.
+      all: blurs of the steps of all unknowns, of each kind.
+      last: blurs of the further steps of the best finding.
       rays: number of pixels of a step of the few numbers.
       last_rays: number of pixels of a step of all unknowns.
       rivals: hypotheses whose error is above that of the best by more than this factor are left
@@ -61,7 +63,8 @@ class SearchSettings:
     pixels: int = 1500
     finalists: int = 2
     few: tuple[int, ...] = (3, 3, 3, 2, 2, 2, 1, 1, 1)
-    all: tuple[int, ...] = (2, 2, 1, 1, 0, 0, 0, 0, 0, 0, 0, 0)
+    all: tuple[int, ...] = (2, 2, 1, 1, 0, 0, 0)
+    last: tuple[int, ...] = (1, 0, 0, 0, 0, 0, 0, 0, 0, 0)
     rays: int = 8192
     last_rays: int = 16384
     rivals: float = 1.25
@@ -171,7 +174,13 @@ def _best_tint(
 def looks_at_all(
     body: Revolution, surface: Backdrop, pixels: Photographs, settings: SearchSettings
 ) -> list[Look]:
-    """Returns the looks at all hypotheses, the best first."""
+    """Returns the looks at all hypotheses, the best first.
+
+    Raises:
+      ReconstructionError: if there are no pixels, or no hypothesis fits into the body.
+    """
+    if not len(pixels.views):
+        raise ReconstructionError("No pixel sees the object. Check the masks and the cameras.")
     generator = np.random.default_rng(settings.seed)
     some = pixels.chosen(draw(generator, len(pixels.views), settings.pixels))
     blurred = photometry.blurred(surface, settings.blur)
@@ -186,6 +195,8 @@ def looks_at_all(
         return found
 
     looks = tried(hypotheses(body, settings))
+    if not looks:
+        raise ReconstructionError("No wall leaves space inside the body. Pass thinner `walls`.")
     for variants in (_other_gaps, _other_indices, _other_mouths):
         best = _best_looks(looks, settings)
         looks += tried(other for each in best for other in variants(each.interior, body, settings))

@@ -20,7 +20,8 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Float
 
-from refref_jax.reconstruct import ReconstructionError, gauss_newton, photometry
+from refref_jax.reconstruct import gauss_newton, photometry
+from refref_jax.reconstruct.contents import COARSE, FINE, Detail, Interior
 from refref_jax.reconstruct.families import Revolution
 from refref_jax.reconstruct.gauss_newton import Candidate, Matrix, Model, Rows, Steps
 from refref_jax.reconstruct.interior_looks import (
@@ -32,7 +33,7 @@ from refref_jax.reconstruct.interior_looks import (
     look,
     looks_at_all,
 )
-from refref_jax.reconstruct.interiors import COARSE, FINE, Detail, Interior, Vessel
+from refref_jax.reconstruct.interiors import Vessel
 from refref_jax.reconstruct.photometry import Backdrop, Photographs
 
 # Errors above this multiple of what the backdrop leaves unexplained are those of a wrong interior.
@@ -63,13 +64,18 @@ class Finding(NamedTuple):
     covariance: Float[np.ndarray, "n n"]
     error: float
 
+    @property
+    def name(self) -> str:
+        """What is inside, in words."""
+        return self.vessel.interior_at_start.name
+
 
 class Found(NamedTuple):
     """Result of a search.
 
     Attributes:
-      best: the simplest finding that is not significantly worse than the best.
-      findings: all findings, in the order of their number of unknowns.
+      best: the simplest finding that is not significantly worse than the best, after further steps.
+      findings: all findings before these, in the order of their number of unknowns.
       looks: all hypotheses that were looked at, the best first.
     """
 
@@ -164,25 +170,26 @@ def search(
       progress: called with a line about each fit.
 
     Raises:
-      ReconstructionError: if there are no pixels, or the body is a ring.
+      ReconstructionError: if there are no pixels, the body is a ring, or no wall fits into it.
     """
-    if not len(pixels.views) or not len(judges.views):
-        raise ReconstructionError("No pixel sees the object. Check the masks and the cameras.")
     settings, say = settings or SearchSettings(), progress or (lambda line: None)
     looks = looks or looks_at_all(body, surface, pixels, settings)
     say(f"{len(looks)} looks; best: {looks[0].interior.name}, error {looks[0].error:.4f}")
     rough = []
     for found in finalists(looks, settings):
-        finding = _few_fitted(body, found.interior, surface, pixels, judges, settings)
-        say(f"{found.interior.name}: looked {found.error:.4f}, error {finding.error:.4f}")
-        rough.append(finding)
+        rough.append(_few_fitted(body, found.interior, surface, pixels, judges, settings))
+        say(f"{rough[-1].name}: looked {found.error:.4f}, error {rough[-1].error:.4f}")
     findings = []
     for each in _best_of_kinds(rough, settings):
-        vessel = Vessel(body, _with_gap(body, each, surface, pixels, settings), detail)
-        finding = _fitted(vessel, surface, pixels, judges, settings, outlines)
-        say(f"{each.vessel.interior_at_start.name}: all unknowns, error {finding.error:.4f}")
-        findings.append(finding)
-    return Found(select(findings, surface, judges), findings, looks)
+        interior = _with_gap(body, each, surface, pixels, settings)
+        start = _started(Vessel(body, interior, detail))
+        findings.append(_fitted(start, surface, pixels, judges, settings, settings.all, outlines))
+        say(f"{interior.name}: all unknowns, error {findings[-1].error:.4f}")
+    best = select(findings, surface, judges)
+    if settings.last:
+        best = _fitted(best, surface, pixels, judges, settings, settings.last, outlines)
+        say(f"{best.name}: further steps, error {best.error:.4f}")
+    return Found(best, findings, looks)
 
 
 def _few_fitted(
@@ -207,18 +214,24 @@ def _few_fitted(
     return _finding(vessel, few.whole(fit.x), fit.covariance, surface, judges)
 
 
+def _started(vessel: Vessel) -> Finding:
+    """Returns a vessel at rest."""
+    return Finding(vessel, vessel.start(), np.eye(vessel.layout.count), np.inf)
+
+
 def _fitted(
-    vessel: Vessel,
+    start: Finding,
     surface: Backdrop,
     pixels: Photographs,
     judges: Photographs,
     settings: SearchSettings,
+    blurs: tuple[int, ...],
     outlines: Callable[[Candidate], Rows] | None,
 ) -> Finding:
     """Returns a hypothesis after steps of all unknowns."""
-    steps = Steps(settings.all, settings.last_rays, settings.rays, _OUTLIERS, seed=settings.seed)
-    x = vessel.start()
-    fit = gauss_newton.fit(vessel, x, surface, pixels, settings=steps, outlines=outlines)
+    vessel, seed = start.vessel, settings.seed + len(blurs)
+    steps = Steps(blurs, settings.last_rays, settings.rays, _OUTLIERS, seed=seed)
+    fit = gauss_newton.fit(vessel, start.x, surface, pixels, settings=steps, outlines=outlines)
     return _finding(vessel, fit.x, fit.covariance, surface, judges)
 
 
@@ -273,7 +286,7 @@ def _best_of_kinds(findings: Sequence[Finding], settings: SearchSettings) -> lis
     """Returns the best finding of each kind that is not far worse than the best, simple first."""
     found: dict[str, Finding] = {}
     for each in sorted(findings, key=lambda each: each.error):
-        found.setdefault(each.vessel.interior_at_start.name, each)
+        found.setdefault(each.name, each)
     best = min(each.error for each in findings)
     kept = [each for each in found.values() if each.error < settings.rivals * best]
     return sorted(kept, key=lambda each: len(each.x))

@@ -15,7 +15,6 @@ Single-View Transmission Imaging (2017), for outer and inner profiles from refra
 """
 
 import dataclasses
-from typing import Literal, NamedTuple
 
 import numpy as np
 import scipy.sparse
@@ -25,17 +24,12 @@ from scipy.spatial import KDTree
 from refref_jax.geometry.triangle_meshes import Mesh
 from refref_jax.optics.interface_rules import NO_PARENT, nested
 from refref_jax.reconstruct import ReconstructionError, walls
+from refref_jax.reconstruct.contents import FINE, Colour, Detail, Interior, Layout
 from refref_jax.reconstruct.families import Revolution, place
 from refref_jax.reconstruct.gauss_newton import Candidate
 from refref_jax.reconstruct.revolution import Curve, Profile, lathe
 from refref_jax.reconstruct.shapes import LARGEST_STEP, LARGEST_TURN, Posed, mesh_of
 from refref_jax.reconstruct.walls import Limits, Moved, Outline, Stretch, Wall
-
-Colour = tuple[float, float, float]
-"""Linear RGB."""
-
-Contents = Literal["none", "air", "liquid", "liquid and air"]
-"""What is inside the glass; `none` is solid glass."""
 
 # Knots of the offsets of the outer and of the inner wall.
 _KNOTS, _INNER_KNOTS = 36, 28
@@ -75,71 +69,6 @@ _FEWEST = 20
 _UPRIGHT = 0.8
 
 
-class Detail(NamedTuple):
-    """Resolution of the meshes of a vessel.
-
-    Attributes:
-      outer: points along the outer wall.
-      inner: points along the inner wall, all of its pieces together.
-      azimuths: number of half-planes.
-    """
-
-    outer: int = 112
-    inner: int = 124
-    azimuths: int = 96
-
-
-FINE = Detail()
-"""Enough for photographs of 200 x 200 pixels."""
-
-COARSE = Detail(outer=72, inner=80, azimuths=64)
-"""Enough for a look through a blurred backdrop."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Interior:
-    """What is inside a vessel, and of what it is made.
-
-    Attributes:
-      contents: what is inside.
-      mouth: whether the vessel is open.
-      wall: distance of the inner from the outer wall at rest, world units.
-      level: height of the liquid's surface above the point of the axis, world units.
-      gap: height of the glass between liquid and air, world units.
-      glass: index of refraction of the glass.
-      liquid: the same of the liquid.
-      tint: factor on light at each crossing of the liquid's surface, linear RGB.
-      glass_tint: the same of the glass.
-      stained: whether the tint of the glass is unknown.
-    """
-
-    contents: Contents = "liquid and air"
-    mouth: bool = False
-    wall: float = 0.1
-    level: float = 0.0
-    gap: float = 0.01
-    glass: float = 1.5
-    liquid: float = 1.36
-    tint: Colour = (1.0, 1.0, 1.0)
-    glass_tint: Colour = (1.0, 1.0, 1.0)
-    stained: bool = False
-
-    @property
-    def filled(self) -> bool:
-        """Whether there is liquid."""
-        return self.contents in ("liquid", "liquid and air")
-
-    @property
-    def name(self) -> str:
-        """What is inside, in words."""
-        return self.contents + (", open" if self.mouth else "")
-
-    @property
-    def level_unknown(self) -> bool:
-        """Whether the liquid has a surface."""
-        return self.contents == "liquid and air"
-
-
 @dataclasses.dataclass(frozen=True)
 class Solid:
     """A part of a scene.
@@ -157,36 +86,6 @@ class Solid:
     index: float
     parent: int
     tint: Colour
-
-
-class Layout:
-    """Where the unknowns of a vessel are; slices, empty for what it does not have."""
-
-    def __init__(self, interior: Interior, outer: int, inner: int) -> None:
-        """Counts the unknowns."""
-        self.axis, self.outer = slice(0, 4), slice(4, 4 + outer)
-        at = 4 + outer
-
-        def take(count: int) -> slice:
-            nonlocal at
-            at += count
-            return slice(at - count, at)
-
-        self.inner = take(inner if interior.contents != "none" else 0)
-        self.level, self.gap = take(interior.level_unknown), take(interior.level_unknown)
-        self.profile = at - 4
-        self.glass, self.liquid = take(1), take(interior.filled)
-        self.tint, self.glass_tint = take(3 * interior.filled), take(3 * interior.stained)
-        self.count = at
-
-    def names(self) -> list[str]:
-        """Returns a name for each unknown."""
-        found = [""] * self.count
-        for name, each in vars(self).items():
-            if isinstance(each, slice):
-                for number in range(each.start, each.stop):
-                    found[number] = name
-        return found
 
 
 class Vessel:
@@ -228,11 +127,9 @@ class Vessel:
                 )
             self._inner = Wall(space, points=detail.inner, knots=_INNER_KNOTS)
             self._rest = self._limits()
-            heights = self._inner.points[:, 1]
-            margin = 2.0 * _THINNEST * self.size
-            self._range = float(heights.min()) + margin, float(heights.max()) - margin
             if interior.mouth:
                 self._rim = self._find_rim()
+            self._range = self._heights()
         self._plan = self._shares()
 
     def _limits(self) -> tuple[Limits, Int[np.ndarray, " points"]]:
@@ -253,10 +150,18 @@ class Vessel:
         empty = np.zeros((len(points), 0))
         return Limits(inward, outward, empty, width), rows
 
+    def _heights(self) -> tuple[float, float]:
+        """Returns the lowest level, and the highest place where the air may begin."""
+        heights, margin = self._inner.points[:, 1], 4.0 * _THINNEST * self.size
+        highest = float(heights.max())
+        if self.interior_at_start.mouth:
+            highest = float(np.interp(self._rim[1], self._inner.at, heights))
+        return float(heights.min()) + margin, highest - margin
+
     def _find_rim(self) -> tuple[float, float]:
         """Returns the lengths at which the outer and the inner wall end at the mouth."""
         upright = np.flatnonzero(self._inner.directions[:, 0] > _UPRIGHT)
-        last = int(upright[-1])
+        last = int(upright[-1]) if len(upright) else 0
         radius = self._inner.points[last, 0]
         high = self._outer.points[:, 1] > self._inner.points[last, 1]
         wide = np.flatnonzero(high & (self._outer.points[:, 0] > radius))
@@ -306,8 +211,9 @@ class Vessel:
             if len(values):
                 numbers[name] = float(values[0])
         if rest.level_unknown:
-            numbers["level"] = float(np.clip(numbers["level"], *self._range))
-            numbers["gap"] = max(numbers["gap"], _LEAST_GAP * self.size)
+            least, (low, high) = _LEAST_GAP * self.size, self._range
+            numbers["level"] = float(np.clip(numbers["level"], low, high - least))
+            numbers["gap"] = float(np.clip(numbers["gap"], least, high - numbers["level"]))
 
         def tint(where: slice, otherwise: Colour) -> Colour:
             if where.stop == where.start:
@@ -415,7 +321,8 @@ class Vessel:
         """Returns the heights of the liquid's surface and of the lower end of the air."""
         layout, now = self.layout, self.interior(x)
         by_level = by[layout.level][0] * (now.level == x[layout.level][0])
-        by_top = by_level + by[layout.gap][0] * (now.gap == x[layout.gap][0])
+        free = now.gap == x[layout.gap][0]
+        by_top = by_level * (now.gap >= x[layout.gap][0]) + by[layout.gap][0] * free
         return [(now.level, by_level), (now.level + now.gap, by_top)]
 
     def _cut(

@@ -10,10 +10,11 @@ import pytest
 from refref_jax.geometry.triangle_meshes import volume
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.reconstruct import ReconstructionError, gauss_newton, interior_looks, photometry
+from refref_jax.reconstruct.contents import Detail, Interior
 from refref_jax.reconstruct.families import Revolution, fit_revolution
 from refref_jax.reconstruct.interior_looks import SearchSettings, hypotheses, look
 from refref_jax.reconstruct.interior_search import Few, Finding, select, unexplained
-from refref_jax.reconstruct.interiors import Detail, Interior, Vessel
+from refref_jax.reconstruct.interiors import Vessel
 from refref_jax.reconstruct.mesh_distance import signed_distance
 from refref_jax.reconstruct.photometry import Backdrop, Photographs
 from refref_jax.reconstruct.revolution import Profile

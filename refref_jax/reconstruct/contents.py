@@ -1,0 +1,108 @@
+"""What is inside a vessel, and where its unknowns are in a vector (NumPy only).
+
+Source: ours.
+"""
+
+import dataclasses
+from typing import Literal, NamedTuple
+
+Colour = tuple[float, float, float]
+"""Linear RGB."""
+
+Contents = Literal["none", "air", "liquid", "liquid and air"]
+"""What is inside the glass; `none` is solid glass."""
+
+
+class Detail(NamedTuple):
+    """Resolution of the meshes of a vessel.
+
+    Attributes:
+      outer: points along the outer wall.
+      inner: points along the inner wall, all of its pieces together.
+      azimuths: number of half-planes.
+    """
+
+    outer: int = 112
+    inner: int = 124
+    azimuths: int = 96
+
+
+FINE = Detail()
+"""Enough for photographs of 200 x 200 pixels."""
+
+COARSE = Detail(outer=72, inner=80, azimuths=64)
+"""Enough for a look through a blurred backdrop."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Interior:
+    """What is inside a vessel, and of what it is made.
+
+    Attributes:
+      contents: what is inside.
+      mouth: whether the vessel is open.
+      wall: distance of the inner from the outer wall at rest, world units.
+      level: height of the liquid's surface above the point of the axis, world units.
+      gap: height of the glass between liquid and air, world units.
+      glass: index of refraction of the glass.
+      liquid: the same of the liquid.
+      tint: factor on light at each crossing of the liquid's surface, linear RGB.
+      glass_tint: the same of the glass.
+      stained: whether the tint of the glass is unknown.
+    """
+
+    contents: Contents = "liquid and air"
+    mouth: bool = False
+    wall: float = 0.1
+    level: float = 0.0
+    gap: float = 0.01
+    glass: float = 1.5
+    liquid: float = 1.36
+    tint: Colour = (1.0, 1.0, 1.0)
+    glass_tint: Colour = (1.0, 1.0, 1.0)
+    stained: bool = False
+
+    @property
+    def filled(self) -> bool:
+        """Whether there is liquid."""
+        return self.contents in ("liquid", "liquid and air")
+
+    @property
+    def name(self) -> str:
+        """What is inside, in words."""
+        return self.contents + (", open" if self.mouth else "")
+
+    @property
+    def level_unknown(self) -> bool:
+        """Whether the liquid has a surface."""
+        return self.contents == "liquid and air"
+
+
+class Layout:
+    """Where the unknowns of a vessel are; slices, empty for what it does not have."""
+
+    def __init__(self, interior: Interior, outer: int, inner: int) -> None:
+        """Counts the unknowns."""
+        self.axis, self.outer = slice(0, 4), slice(4, 4 + outer)
+        at = 4 + outer
+
+        def take(count: int) -> slice:
+            nonlocal at
+            at += count
+            return slice(at - count, at)
+
+        self.inner = take(inner if interior.contents != "none" else 0)
+        self.level, self.gap = take(interior.level_unknown), take(interior.level_unknown)
+        self.profile = at - 4
+        self.glass, self.liquid = take(1), take(interior.filled)
+        self.tint, self.glass_tint = take(3 * interior.filled), take(3 * interior.stained)
+        self.count = at
+
+    def names(self) -> list[str]:
+        """Returns a name for each unknown."""
+        found = [""] * self.count
+        for name, each in vars(self).items():
+            if isinstance(each, slice):
+                for number in range(each.start, each.stop):
+                    found[number] = name
+        return found
