@@ -236,16 +236,17 @@ def _vessels(
             looks=looks,
             progress=lambda line: bar.show(min(next(count), 99), line),
         )
-        bar.show(100, f"vessel: {found.best.vessel.interior_at_start.name}")
+        bar.show(100, f"vessel: {found.best.name}")
+    others = [each for each in found.findings if each.name != found.best.name]
     return [
         judged(
-            f"vessel: {each.vessel.interior_at_start.name}",
+            f"vessel: {each.name}",
             each.vessel,
             Fit(each.x, each.covariance, ()),
             surface,
             seen.judges,
         )
-        for each in found.findings
+        for each in (found.best, *others)
     ]
 
 

@@ -24,6 +24,7 @@ from typing import NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from refref_jax import numerics
@@ -239,7 +240,11 @@ def residuals(
 
 def encode(linear: Float[np.ndarray, "rays 3"]) -> Float[np.ndarray, "rays 3"]:
     """Returns linear RGB as sRGB in `[0, 1]`."""
-    return np.asarray(jnp.clip(pixels.linear_to_srgb(jnp.asarray(linear)), 0.0, 1.0), np.float64)
+    return np.asarray(_encode(linear), np.float64)
+
+
+def _encode(linear: Float[ArrayLike, "rays 3"]) -> Float[Array, "rays 3"]:
+    return jnp.clip(pixels.linear_to_srgb(jnp.asarray(linear)), 0.0, 1.0)
 
 
 def _in_tiles(render: Callable[[Rays], _Tree], rays: Rays) -> _Tree:
@@ -364,7 +369,7 @@ def _slopes(mips: Mips, lookups: Lookups) -> Float[Array, "rays 2 3"]:
 def make_backdrop(
     domain: Domain,
     pyramid: backdrop.Pyramid,
-    coverage: Float[np.ndarray, "6 side side"],
+    coverage: Float[ArrayLike, "6 side side"],
 ) -> Backdrop:
     """Returns a solved backdrop, to be looked up.
 

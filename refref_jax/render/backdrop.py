@@ -178,11 +178,7 @@ def place_on_face(
 ) -> Float[Array, "2"]:
     """Returns where a ray meets a face of the surface, in `[-1, 1]` along both of its edges.
 
-    Args:
-      domain: scene bounds.
-      axis: axis of the face; of its two faces, the one ahead of the ray.
-      origin: origin of the ray, world units.
-      direction: unit direction of the ray.
+    The face is that across `axis` ahead of the ray, whose origin is in world units.
     """
     towards = to_surface(domain, origin, direction, axis=axis)
     major = jnp.abs(towards[axis])

@@ -193,8 +193,7 @@ def read(
     def trace(views: Int[np.ndarray, " views"]) -> Block:
         each: list[_Seen] = []
         drawn = _drawn(len(views) * photographs[0, ..., 0].size, share, (draw, int(views[0])))
-        if among is not None:
-            drawn &= among[views].reshape(-1)
+        drawn = drawn if among is None else drawn & among[views].reshape(-1)
         place = np.cumsum(drawn, dtype=np.int32) - 1
         for start in range(0, len(views), group):
             some = views[start : start + group]
@@ -215,8 +214,8 @@ def read(
         block = _block(joined, photographs[views], views, drawn)
         if not np.any(joined.hidden):
             return block
-        hidden = joined.lookups.pixels[joined.hidden]
-        return of_pixels(block, np.setdiff1d(np.arange(len(block.srgb)), hidden))
+        seen = np.setdiff1d(np.arange(len(block.srgb)), joined.lookups.pixels[joined.hidden])
+        return of_pixels(block, seen)
 
     split = np.array_split(np.arange(len(photographs)), min(blocks, len(photographs)))
     return tuple(jax.device_put(block) for block in at_once(trace, split))
