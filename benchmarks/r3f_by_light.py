@@ -6,7 +6,7 @@ Each scene is reconstructed from its images and masks as `experiments.reconstruc
 table has, for the surface from masks, for every shape that light fitted and for the scene's own
 mesh, the mean error of pixels that were not fitted, the index of refraction, and the angle between
 its normals and the true ones. The second has the results of training with the reconstruction, and
-with the scene's own meshes: PSNR in the mask on the test split, with a backdrop and, with
+with the scene's own meshes: masked PSNR on the test split, with a backdrop and, with
 `--field_steps`, with a field. Finished reconstructions and trainings are reused.
 
 Asserted are the bounds of `_MUST` for the scenes named there, and for all others that light is no
@@ -162,7 +162,7 @@ def _train_all(scene: Path) -> list[str]:
         print(f"| {name} | {world} | {cells} |", flush=True)
         must = _MUST.get(name.split("_", 2)[-1])
         if world == "backdrop" and must and must.psnr and found["light"] < must.psnr:
-            wrong.append(f"{name}: {found['light']:.2f} dB in the mask, {must.psnr} wanted")
+            wrong.append(f"{name}: {found['light']:.2f} dB masked, {must.psnr} wanted")
     return wrong
 
 

@@ -151,8 +151,8 @@ def find_primitives(
       settings: path settings.
 
     Returns:
-      Triangle at each bend, and at the end of the last segment; `NO_PRIMITIVE` where the path does
-      not go on.
+      Triangle at each bend, and at the end of the last segment; `NO_PRIMITIVE` where the path has
+      ended.
     """
     _, segments, _ = _scan(scene, ray, reflects, settings, None, "cone", None)
     return jnp.where(segments.used, segments.primitive, NO_PRIMITIVE)

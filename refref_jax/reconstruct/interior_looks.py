@@ -45,15 +45,16 @@ class SearchSettings:
       finalists: number of hypotheses of each kind that are improved.
       few: blurs of the steps of the few numbers of a hypothesis.
       all: blurs of the steps of all unknowns, of each kind.
-      last: blurs of the further steps of the best finding.
+      last: blurs of the further steps of the best findings.
       rays: number of pixels of a step of the few numbers.
       last_rays: number of pixels of a step of all unknowns.
       rivals: hypotheses whose error is above that of the best by more than this factor are left
         out before all unknowns are fitted.
+      close: the same factor before these further steps.
       seed: seed of the draws.
     """
 
-    walls: tuple[float, ...] = (0.025, 0.05, 0.1, 0.15)
+    walls: tuple[float, ...] = (0.0125, 0.025, 0.05, 0.1, 0.15)
     levels: int = 10
     gaps: tuple[float, ...] = (0.004, 0.04)
     indices: tuple[float, ...] = (1.36, 1.333, 1.47)
@@ -68,6 +69,7 @@ class SearchSettings:
     rays: int = 8192
     last_rays: int = 16384
     rivals: float = 1.25
+    close: float = 1.05
     seed: int = 0
 
 

@@ -1,6 +1,6 @@
 """Finds out what is inside a vessel of revolution, from photographs of light refracted by it.
 
-Descent can not turn solid glass into a bottle of water: what is seen through it moves by tens of
+Descent cannot turn solid glass into a bottle of water: what is seen through it moves by tens of
 degrees. So `search` looks at many hypotheses through a blurred backdrop, where a rough one is
 already better than none; tints come first, because they remove most of the error, and are found
 without tracing light again. The best hypotheses of each kind are improved by Gauss-Newton steps,
@@ -74,8 +74,8 @@ class Found(NamedTuple):
     """Result of a search.
 
     Attributes:
-      best: the simplest finding that is not significantly worse than the best, after further steps.
-      findings: all findings before these, in the order of their number of unknowns.
+      best: the simplest finding that is not significantly worse than the best.
+      findings: all findings, in the order of their number of unknowns.
       looks: all hypotheses that were looked at, the best first.
     """
 
@@ -165,7 +165,7 @@ def search(
       judges: pixels of other photographs, which decide between hypotheses.
       settings: settings of the search.
       detail: resolution of the meshes of the last fit.
-      outlines: equations of the masks' outlines, for the last fit.
+      outlines: equations of the masks' outlines, for that fit.
       looks: looks at all hypotheses, if there are any yet (`looks_at_all`).
       progress: called with a line about each fit.
 
@@ -175,21 +175,27 @@ def search(
     settings, say = settings or SearchSettings(), progress or (lambda line: None)
     looks = looks or looks_at_all(body, surface, pixels, settings)
     say(f"{len(looks)} looks; best: {looks[0].interior.name}, error {looks[0].error:.4f}")
-    rough = []
+    rough, findings = [], []
     for found in finalists(looks, settings):
         rough.append(_few_fitted(body, found.interior, surface, pixels, judges, settings))
         say(f"{rough[-1].name}: looked {found.error:.4f}, error {rough[-1].error:.4f}")
-    findings = []
     for each in _best_of_kinds(rough, settings):
         interior = _with_gap(body, each, surface, pixels, settings)
         start = _started(Vessel(body, interior, detail))
         findings.append(_fitted(start, surface, pixels, judges, settings, settings.all, outlines))
         say(f"{interior.name}: all unknowns, error {findings[-1].error:.4f}")
-    best = select(findings, surface, judges)
-    if settings.last:
-        best = _fitted(best, surface, pixels, judges, settings, settings.last, outlines)
-        say(f"{best.name}: further steps, error {best.error:.4f}")
-    return Found(best, findings, looks)
+    steps = settings.last
+    for number in _close(findings, settings) if steps else []:
+        last = _fitted(findings[number], surface, pixels, judges, settings, steps, outlines)
+        say(f"{last.name}: further steps, error {last.error:.4f}")
+        findings[number] = last
+    return Found(select(findings, surface, judges), findings, looks)
+
+
+def _close(findings: Sequence[Finding], settings: SearchSettings) -> list[int]:
+    """Returns which findings are not clearly worse than the best."""
+    least = min(each.error for each in findings)
+    return [n for n, each in enumerate(findings) if each.error <= settings.close * least]
 
 
 def _few_fitted(

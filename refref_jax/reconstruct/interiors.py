@@ -6,7 +6,7 @@ small height (the *gap*), and air above. The mouth may be open; then the glass e
 the air inside is that outside. `Vessel` is a `gauss_newton.Model`; `interior_search` finds out what
 is inside.
 
-What this can not represent: handles and spouts; a tilted level, or its rise at the wall; drops and
+What this cannot represent: handles and spouts; a tilted level, or its rise at the wall; drops and
 bubbles; liquid in a ring around a raised bottom that is higher than the level; tilted vessels;
 walls that reach into each other; a stopper of another material.
 

@@ -10,7 +10,7 @@ The first factor is small: differences of the radiance over the pixel's own foot
 the difference between the main path and the pixel's other light, which takes its share. The second
 is exact, and dense only in the corners and normals of the few triangles that the path meets.
 Nothing is ever differentiated through the whole mesh. The sequence of triangles is held fixed, as
-in `differentiable_paths`: a caller traces anew for every linearisation.
+in `differentiable_paths`: a caller traces again for every linearisation.
 
 This is one of the modules that call `jax.jit`.
 

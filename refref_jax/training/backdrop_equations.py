@@ -175,9 +175,8 @@ def read(
     """
     scene = jax.device_put(scene)
     rays_per_view = photographs.shape[1] * photographs.shape[2] * side**2
-    group = max(1, images.RAYS_OF_A_BAND // rays_per_view)
+    group, done = max(1, images.RAYS_OF_A_BAND // rays_per_view), itertools.count(1)
     tile = images.size_for(min(group, len(photographs)) * rays_per_view, most=images.TILE)
-    done = itertools.count(1)
 
     look = functools.partial(
         _look,
