@@ -77,7 +77,7 @@ def _photograph(mesh: Mesh, surface: Backdrop, scene: Path, split: str, seed: in
     view, row, column = np.nonzero(inside)
     rays = pixel_rays(cameras, view, row, column)
     model = shape_from_refraction.SingleObject(FixedShape(mesh), _INDEX)
-    body = gauss_newton.body_of(model.pose(model.start()))
+    body = gauss_newton.traced_object(model.pose(model.start()))
     rgb = photometry.encode(photometry.predict(body, surface, rays).linear)
     noise = np.random.default_rng(seed).normal(0.0, _NOISE.value, rgb.shape)
     levels = np.round(255.0 * np.clip(rgb + noise, 0.0, 1.0))

@@ -215,19 +215,19 @@ def _vessels(
 
     The looks at hypotheses decide: if solid glass is the best of them, there is no vessel.
     """
-    body = families.fit_revolution(mesh, furthest=_FURTHEST)
-    if masks.error < _UNEXPLAINED or body is None or body.closed:
+    outer = families.fit_revolution(mesh, furthest=_FURTHEST)
+    if masks.error < _UNEXPLAINED or outer is None or outer.closed:
         return []
     settings = SearchSettings(seed=seed)
     with ProgressBar("inside", 100) as bar:
         bar.show(0, "looking at hypotheses")
-        looks = interior_looks.looks_at_all(body, surface, seen.fitted, settings)
+        looks = interior_looks.looks_at_all(outer, surface, seen.fitted, settings)
         if looks[0].interior.contents == "none":
             bar.show(100, "solid glass")
             return []
         count = itertools.count(10, 8)
         found = interior_search.search(
-            body,
+            outer,
             surface,
             seen.fitted,
             seen.judges,
@@ -329,8 +329,8 @@ def _panels(
     photograph = image.astype(np.float64) / 255.0
     predicted = []
     for trial in trials:
-        body = gauss_newton.body_of(trial.model.pose(trial.fit.x))
-        linear = photometry.predict(body, surface, flat).linear
+        traced = gauss_newton.traced_object(trial.model.pose(trial.fit.x))
+        linear = photometry.predict(traced, surface, flat).linear
         predicted.append(photometry.encode(linear).reshape(photograph.shape))
     errors = [
         np.where(mask, np.sqrt(np.mean((each - photograph) ** 2, axis=-1)), np.nan)

@@ -35,7 +35,7 @@ from jaxtyping import Float, Int
 from refref_jax.geometry.bvh import NO_PRIMITIVE
 from refref_jax.optics.media import Interfaces
 from refref_jax.reconstruct import ReconstructionError, photometry
-from refref_jax.reconstruct.photometry import Backdrop, Body, Photographs
+from refref_jax.reconstruct.photometry import Backdrop, Photographs, TracedObject
 from refref_jax.reconstruct.shapes import Posed
 
 Matrix: TypeAlias = Float[np.ndarray, "_ _"] | scipy.sparse.csr_array
@@ -182,7 +182,7 @@ class Equations(NamedTuple):
     by_view: Float[np.ndarray, "views unknowns"]
 
 
-def body_of(candidate: Candidate) -> Body:
+def traced_object(candidate: Candidate) -> TracedObject:
     """Returns the scene of a candidate, on the device."""
     parts = candidate.parts
     return photometry.assemble(
@@ -193,9 +193,11 @@ def body_of(candidate: Candidate) -> Body:
     )
 
 
-def errors_of(body: Body, surface: Backdrop, pixels: Photographs) -> Float[np.ndarray, " rays"]:
+def errors_of(
+    traced: TracedObject, surface: Backdrop, pixels: Photographs
+) -> Float[np.ndarray, " rays"]:
     """Returns the robust error of each pixel in sRGB: root mean square of channels, capped."""
-    return robust_errors(photometry.predict(body, surface, pixels.rays), pixels.rgb)
+    return robust_errors(photometry.predict(traced, surface, pixels.rays), pixels.rgb)
 
 
 def robust_errors(
@@ -238,11 +240,13 @@ def fit(
     for number, blur in enumerate(settings.blurs):
         seen = photometry.blurred(surface, blur)
         candidate = model.pose(x)
-        body = body_of(candidate)
-        light = linearise(candidate, body, seen, draw(settings.rays), settings)
+        traced = traced_object(candidate)
+        light = linearise(candidate, traced, seen, draw(settings.rays), settings)
         if outlines is not None:
             light = _with_rows(light, outlines(candidate))
-        x, damping, fact = _step(model, x, body, light, seen, draw(settings.judges), damping, blur)
+        x, damping, fact = _step(
+            model, x, traced, light, seen, draw(settings.judges), damping, blur
+        )
         facts.append(fact)
         if progress is not None:
             progress(number + 1, fact)
@@ -261,7 +265,7 @@ def _draw(pixels: Photographs, generator: np.random.Generator, count: int) -> Ph
 def _step(
     model: Model,
     x: Float[np.ndarray, " unknowns"],
-    body: Body,
+    traced: TracedObject,
     light: Equations,
     surface: Backdrop,
     judges: Photographs,
@@ -272,8 +276,8 @@ def _step(
     precision, pull = model.prior(x)
     matrix, gradient = light.matrix + precision, light.gradient + pull
     scales = model.scales()
-    before = float(errors_of(body, surface, judges).mean())
-    error = lambda y: float(errors_of(body_of(model.pose(y)), surface, judges).mean())  # noqa: E731
+    before = float(errors_of(traced, surface, judges).mean())
+    error = lambda y: float(errors_of(traced_object(model.pose(y)), surface, judges).mean())  # noqa: E731
     for _ in range(3):
         damped = matrix + damping * np.diag(np.diag(light.matrix) + np.diag(precision))
         change = -scipy.linalg.solve(damped, gradient, assume_a="pos")
@@ -318,23 +322,27 @@ def _with_rows(light: Equations, rows: Rows) -> Equations:
 
 
 def linearise(
-    candidate: Candidate, body: Body, surface: Backdrop, pixels: Photographs, settings: Steps
+    candidate: Candidate,
+    traced: TracedObject,
+    surface: Backdrop,
+    pixels: Photographs,
+    settings: Steps,
 ) -> Equations:
     """Returns the normal equations of some pixels.
 
     Args:
       candidate: scene with derivatives.
-      body: the same scene on the device.
+      traced: the same scene on the device.
       surface: backdrop.
       pixels: some pixels.
       settings: settings of the fit, of which the share of outliers counts.
     """
-    predicted = photometry.predict(body, surface, pixels.rays)
-    found = photometry.sensitivities(body, surface, pixels.rays, predicted)
+    predicted = photometry.predict(traced, surface, pixels.rays)
+    found = photometry.sensitivities(traced, surface, pixels.rays, predicted)
     error = photometry.residuals(predicted.linear, pixels.rgb)
     encode = 1.055 / 2.4 * np.maximum(predicted.linear, _DARK) ** (1.0 / 2.4 - 1.0)
     slopes = found.slopes * encode[:, None]
-    coordinates = _by_unknowns(candidate, body, found)
+    coordinates = _by_unknowns(candidate, traced, found)
     usable = found.usable & (predicted.dropped < 1.0 - _FOLLOWED) & (found.coverage > _SEEN)
     weights = _robust_weights(error, usable)
     weights = weights * _unsaturated(predicted.linear, pixels.rgb)
@@ -373,7 +381,9 @@ def _covariance(
     return inverse * max(1.0, alike)
 
 
-def _by_unknowns(candidate: Candidate, body: Body, found: photometry.Sensitivities) -> Matrix:
+def _by_unknowns(
+    candidate: Candidate, traced: TracedObject, found: photometry.Sensitivities
+) -> Matrix:
     """Returns the derivatives of the coordinates of all rays by the unknowns, ray-major."""
     parts = candidate.parts
     first = np.cumsum([0] + [len(part.vertices) for part in parts]).tolist()
@@ -381,7 +391,7 @@ def _by_unknowns(candidate: Candidate, body: Body, found: photometry.Sensitiviti
     vertices = np.concatenate([p.faces + n for p, n in zip(parts, first, strict=False)])
     normals = np.concatenate([p.normal_ids + n for p, n in zip(parts, first_normal, strict=False)])
     ray, bend = np.nonzero(found.primitives != NO_PRIMITIVE)
-    face = body.faces[found.primitives[ray, bend]]
+    face = traced.faces[found.primitives[ray, bend]]
     count = len(found.primitives)
     total = _scattered(found.by_corners[ray, :, bend], ray, vertices[face], (count, first[-1]))
     by = _stacked([part.by_vertices for part in parts])

@@ -34,7 +34,7 @@ class SearchSettings:
     """Settings of a search.
 
     Attributes:
-      walls: thicknesses of the wall, as shares of the diameter.
+      thicknesses: thicknesses of the wall, as shares of the diameter.
       levels: number of heights of the liquid's surface.
       gaps: heights of the glass between liquid and air, as shares of the diameter.
       indices: indices of refraction of the liquid.
@@ -54,7 +54,7 @@ class SearchSettings:
       seed: seed of the draws.
     """
 
-    walls: tuple[float, ...] = (0.0125, 0.025, 0.05, 0.1, 0.15)
+    thicknesses: tuple[float, ...] = (0.0125, 0.025, 0.05, 0.1, 0.15)
     levels: int = 10
     gaps: tuple[float, ...] = (0.004, 0.04)
     indices: tuple[float, ...] = (1.36, 1.333, 1.47)
@@ -85,16 +85,16 @@ class Look(NamedTuple):
     error: float
 
 
-def hypotheses(body: Revolution, settings: SearchSettings = SearchSettings()) -> list[Interior]:
-    """Returns what may be inside a body, the simplest first.
+def hypotheses(outer: Revolution, settings: SearchSettings = SearchSettings()) -> list[Interior]:
+    """Returns what may be inside a outer, the simplest first.
 
     Indices other than the first, and open vessels, are tried later, for the best of these.
     """
-    size, low = extent(body)
+    size, low = extent(outer)
     kinds: tuple[Contents, ...] = ("none", "air", "liquid", "liquid and air")
     found = []
     for contents in kinds:
-        for wall in settings.walls if contents != "none" else settings.walls[:1]:
+        for wall in settings.thicknesses if contents != "none" else settings.thicknesses[:1]:
             at = Interior(
                 contents,
                 wall=wall * size,
@@ -112,14 +112,14 @@ def hypotheses(body: Revolution, settings: SearchSettings = SearchSettings()) ->
     return found
 
 
-def extent(body: Revolution) -> tuple[float, float]:
-    """Returns the height of a body and its lower end."""
-    heights = body.points[:, 1]
+def extent(outer: Revolution) -> tuple[float, float]:
+    """Returns the height of a surface and its lower end."""
+    heights = outer.points[:, 1]
     return float(heights.max() - heights.min()), float(heights.min())
 
 
 def look(
-    body: Revolution,
+    outer: Revolution,
     interior: Interior,
     surface: Backdrop,
     pixels: Photographs,
@@ -136,10 +136,10 @@ def look(
     solid = interior.contents == "none"
     # Solid glass is looked at as if it had an inside of glass: one compiled program serves all.
     seen = dataclasses.replace(interior, contents="liquid", liquid=interior.glass)
-    vessel = Vessel(body, seen if solid else interior, detail)
+    vessel = Vessel(outer, seen if solid else interior, detail)
     x, layout = vessel.start(), vessel.layout
     where = layout.tint if interior.filled else layout.glass_tint
-    scene = gauss_newton.body_of(vessel.pose(x))
+    scene = gauss_newton.traced_object(vessel.pose(x))
     clear = photometry.predict(scene, surface, pixels.rays)
     linear = clear.linear
     if where.stop > where.start:
@@ -174,12 +174,12 @@ def _best_tint(
 
 
 def looks_at_all(
-    body: Revolution, surface: Backdrop, pixels: Photographs, settings: SearchSettings
+    outer: Revolution, surface: Backdrop, pixels: Photographs, settings: SearchSettings
 ) -> list[Look]:
     """Returns the looks at all hypotheses, the best first.
 
     Raises:
-      ReconstructionError: if there are no pixels, or no hypothesis fits into the body.
+      ReconstructionError: if there are no pixels, or no hypothesis fits into the object.
     """
     if not len(pixels.views):
         raise ReconstructionError("No pixel sees the object. Check the masks and the cameras.")
@@ -191,17 +191,19 @@ def looks_at_all(
         found = []
         for interior in interiors:
             try:
-                found.append(look(body, interior, blurred, some))
+                found.append(look(outer, interior, blurred, some))
             except ReconstructionError:
                 continue
         return found
 
-    looks = tried(hypotheses(body, settings))
+    looks = tried(hypotheses(outer, settings))
     if not looks:
-        raise ReconstructionError("No wall leaves space inside the body. Pass thinner `walls`.")
+        raise ReconstructionError(
+            "No wall leaves space inside the object. Pass smaller `thicknesses`."
+        )
     for variants in (_other_gaps, _other_indices, _other_mouths):
         best = _best_looks(looks, settings)
-        looks += tried(other for each in best for other in variants(each.interior, body, settings))
+        looks += tried(other for each in best for other in variants(each.interior, outer, settings))
     return sorted(looks, key=lambda each: each.error)
 
 
@@ -216,9 +218,9 @@ def draw(generator: np.random.Generator, every: int, count: int) -> Int[np.ndarr
     return generator.choice(every, min(count, every), replace=False)
 
 
-def _other_gaps(at: Interior, body: Revolution, settings: SearchSettings) -> list[Interior]:
+def _other_gaps(at: Interior, outer: Revolution, settings: SearchSettings) -> list[Interior]:
     """Returns the same with other gaps, whose middle stays where it is."""
-    size = extent(body)[0]
+    size = extent(outer)[0]
     if not at.level_unknown:
         return []
     gaps = [gap * size for gap in settings.gaps]
@@ -229,16 +231,16 @@ def _other_gaps(at: Interior, body: Revolution, settings: SearchSettings) -> lis
     ]
 
 
-def _other_indices(at: Interior, body: Revolution, settings: SearchSettings) -> list[Interior]:
+def _other_indices(at: Interior, outer: Revolution, settings: SearchSettings) -> list[Interior]:
     """Returns the same with other liquids."""
-    del body
+    del outer
     others = [index for index in settings.indices if index != at.liquid]
     return [dataclasses.replace(at, liquid=index) for index in others if at.filled]
 
 
-def _other_mouths(at: Interior, body: Revolution, settings: SearchSettings) -> list[Interior]:
+def _other_mouths(at: Interior, outer: Revolution, settings: SearchSettings) -> list[Interior]:
     """Returns the same with an open mouth."""
-    del body
+    del outer
     fits = at.contents in ("air", "liquid and air") and True in settings.mouths
     return [dataclasses.replace(at, mouth=True)] if fits else []
 

@@ -135,17 +135,17 @@ class Few:
 
 
 def unexplained(error: float, floor: float) -> bool:
-    """Returns whether the error of the best single body calls for a search of what is inside.
+    """Returns whether the error of the best single solid calls for a search of what is inside.
 
     Args:
-      error: mean robust error of pixels through the body (`gauss_newton.errors_of`).
+      error: mean robust error of pixels through the object (`gauss_newton.errors_of`).
       floor: mean robust error of pixels beside it, which see the backdrop directly.
     """
     return error > _UNEXPLAINED * floor
 
 
 def search(
-    body: Revolution,
+    outer: Revolution,
     surface: Backdrop,
     pixels: Photographs,
     judges: Photographs,
@@ -159,7 +159,7 @@ def search(
     """Finds what is inside a vessel.
 
     Args:
-      body: the outer surface, fitted to masks only.
+      outer: the outer surface, fitted to masks only.
       surface: backdrop.
       pixels: pixels that see the vessel, of photographs to fit to.
       judges: pixels of other photographs, which decide between hypotheses.
@@ -170,18 +170,18 @@ def search(
       progress: called with a line about each fit.
 
     Raises:
-      ReconstructionError: if there are no pixels, the body is a ring, or no wall fits into it.
+      ReconstructionError: if there are no pixels, the object is a ring, or no wall fits into it.
     """
     settings, say = settings or SearchSettings(), progress or (lambda line: None)
-    looks = looks or looks_at_all(body, surface, pixels, settings)
+    looks = looks or looks_at_all(outer, surface, pixels, settings)
     say(f"{len(looks)} looks; best: {looks[0].interior.name}, error {looks[0].error:.4f}")
     rough, findings = [], []
     for found in finalists(looks, settings):
-        rough.append(_few_fitted(body, found.interior, surface, pixels, judges, settings))
+        rough.append(_few_fitted(outer, found.interior, surface, pixels, judges, settings))
         say(f"{rough[-1].name}: looked {found.error:.4f}, error {rough[-1].error:.4f}")
     for each in _best_of_kinds(rough, settings):
-        interior = _with_gap(body, each, surface, pixels, settings)
-        start = _started(Vessel(body, interior, detail))
+        interior = _with_gap(outer, each, surface, pixels, settings)
+        start = _started(Vessel(outer, interior, detail))
         findings.append(_fitted(start, surface, pixels, judges, settings, settings.all, outlines))
         say(f"{interior.name}: all unknowns, error {findings[-1].error:.4f}")
     steps = settings.last
@@ -199,7 +199,7 @@ def _close(findings: Sequence[Finding], settings: SearchSettings) -> list[int]:
 
 
 def _few_fitted(
-    body: Revolution,
+    outer: Revolution,
     interior: Interior,
     surface: Backdrop,
     pixels: Photographs,
@@ -207,7 +207,7 @@ def _few_fitted(
     settings: SearchSettings,
 ) -> Finding:
     """Returns a hypothesis after steps of its few numbers and of the thickness of its wall."""
-    vessel = Vessel(body, interior, COARSE)
+    vessel = Vessel(outer, interior, COARSE)
     x, layout = vessel.start(), vessel.layout
     one = np.eye(len(x))
     columns = [one[:, layout.outer].sum(axis=1)]
@@ -248,7 +248,7 @@ def _finding(
     surface: Backdrop,
     judges: Photographs,
 ) -> Finding:
-    errors = gauss_newton.errors_of(gauss_newton.body_of(vessel.pose(x)), surface, judges)
+    errors = gauss_newton.errors_of(gauss_newton.traced_object(vessel.pose(x)), surface, judges)
     return Finding(vessel, x, covariance, float(errors.mean()))
 
 
@@ -263,7 +263,7 @@ def _with_wall(finding: Finding) -> Interior:
 
 
 def _with_gap(
-    body: Revolution,
+    outer: Revolution,
     finding: Finding,
     surface: Backdrop,
     pixels: Photographs,
@@ -274,17 +274,17 @@ def _with_gap(
     A thin gap does not show which way it should grow, so several are looked at, upwards from the
     level and downwards from the air.
     """
-    at, size = _with_wall(finding), extent(body)[0]
+    at, size = _with_wall(finding), extent(outer)[0]
     if not at.level_unknown:
         return at
     generator = np.random.default_rng(settings.seed + 1)
     some = pixels.chosen(draw(generator, len(pixels.views), settings.pixels))
     blurred = photometry.blurred(surface, _GAP_BLUR)
-    found = [look(body, at, blurred, some)]
+    found = [look(outer, at, blurred, some)]
     for gap in _GAPS:
         for shift in (0.0, at.gap - gap * size):
             other = dataclasses.replace(at, gap=gap * size, level=at.level + shift)
-            found.append(look(body, other, blurred, some))
+            found.append(look(outer, other, blurred, some))
     return min(found, key=lambda each: each.error).interior
 
 
@@ -309,7 +309,9 @@ def select(findings: Sequence[Finding], surface: Backdrop, judges: Photographs) 
       judges: pixels that none was fitted to.
     """
     errors = [
-        gauss_newton.errors_of(gauss_newton.body_of(each.vessel.pose(each.x)), surface, judges)
+        gauss_newton.errors_of(
+            gauss_newton.traced_object(each.vessel.pose(each.x)), surface, judges
+        )
         for each in findings
     ]
     best = errors[int(np.argmin([each.mean() for each in errors]))]

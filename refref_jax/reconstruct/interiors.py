@@ -106,17 +106,17 @@ class Vessel:
       size: diameter, world units.
     """
 
-    def __init__(self, body: Revolution, interior: Interior, detail: Detail = FINE) -> None:
+    def __init__(self, outer: Revolution, interior: Interior, detail: Detail = FINE) -> None:
         """Takes the outer surface and what is inside.
 
         Raises:
-          ReconstructionError: if the body is a ring, or its wall leaves no space inside.
+          ReconstructionError: if the object is a ring, or its wall leaves no space inside.
         """
-        if body.closed:
+        if outer.closed:
             raise ReconstructionError("A ring has no inside that the axis meets. Pass a vessel.")
-        self.body, self.interior_at_start, self.detail = body, interior, detail
-        profile = Profile(body.points, closed=False)
-        self.size = _size(body.points)
+        self.outer, self.interior_at_start, self.detail = outer, interior, detail
+        profile = Profile(outer.points, closed=False)
+        self.size = _size(outer.points)
         self._outer = Wall(profile, points=detail.outer, knots=_KNOTS)
         self.layout = Layout(interior, _KNOTS, _INNER_KNOTS)
         if interior.contents != "none":
@@ -271,7 +271,7 @@ class Vessel:
         """Returns a profile turned around the axis, with columns for all unknowns."""
         shift, azimuths = np.append(x[:4], 0.0), self.detail.azimuths
         connected = lathe(outline.poles, outline.segments, outline.ends, azimuths)
-        posed = place(outline.turned, connected, azimuths, self.body.axis, shift)
+        posed = place(outline.turned, connected, azimuths, self.outer.axis, shift)
 
         def columns(matrix: np.ndarray) -> np.ndarray:
             # A shift along the axis is an offset of the profile.

@@ -76,8 +76,8 @@ def judged(name: str, model: Model, fit: Fit, surface: Backdrop, judges: Photogr
       surface: backdrop.
       judges: pixels that it was not fitted to.
     """
-    body = gauss_newton.body_of(model.pose(fit.x))
-    errors = gauss_newton.errors_of(body, surface, judges)
+    traced = gauss_newton.traced_object(model.pose(fit.x))
+    errors = gauss_newton.errors_of(traced, surface, judges)
     _, views = np.unique(judges.views, return_inverse=True)
     return Trial(name, model, fit, np.bincount(views, errors) / np.bincount(views))
 

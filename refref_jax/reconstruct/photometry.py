@@ -97,7 +97,7 @@ class Photographs(NamedTuple):
         return jax.tree.map(lambda x: numerics.host_array(np.asarray(x)[some]), self)
 
 
-class Body(NamedTuple):
+class TracedObject(NamedTuple):
     """A scene on the device, and the faces that its primitives are.
 
     Attributes:
@@ -152,7 +152,7 @@ def assemble(
     normals: Float[np.ndarray, "faces 3 3"],
     parts: Int[np.ndarray, " faces"],
     interfaces: Interfaces,
-) -> Body:
+) -> TracedObject:
     """Returns a scene of triangles, on the device.
 
     Args:
@@ -169,7 +169,7 @@ def assemble(
         numerics.host_array(parts[order].astype(np.int32)),
         numerics.host_array(np.zeros((0, 3, 3), np.float32)),
     )
-    return Body(jax.device_put(Scene(packed, interfaces)), order)
+    return TracedObject(jax.device_put(Scene(packed, interfaces)), order)
 
 
 def blurred(surface: Backdrop, halvings: int) -> Backdrop:
@@ -192,12 +192,12 @@ def blurred(surface: Backdrop, halvings: int) -> Backdrop:
 _mipmap = jax.jit(backdrop.mipmap, static_argnames="space")
 
 
-def predict(body: Body, surface: Backdrop, rays: Rays) -> Prediction:
+def predict(traced: TracedObject, surface: Backdrop, rays: Rays) -> Prediction:
     """Renders pixels along the whole path tree, with one ray and its footprint each."""
 
     def render(part: Rays) -> Prediction:
         return _predict(
-            body.scene,
+            traced.scene,
             surface.mips,
             part,
             domain=surface.domain,
@@ -208,13 +208,13 @@ def predict(body: Body, surface: Backdrop, rays: Rays) -> Prediction:
 
 
 def sensitivities(
-    body: Body, surface: Backdrop, rays: Rays, predicted: Prediction
+    traced: TracedObject, surface: Backdrop, rays: Rays, predicted: Prediction
 ) -> Sensitivities:
     """Differentiates pixels by the corners, normals and indices that their main paths meet."""
 
     def differentiate(part: Rays) -> tuple[Sensitivities, Array, Array]:
         return _differentiate(
-            body.scene,
+            traced.scene,
             surface.mips,
             surface.coverage,
             part,

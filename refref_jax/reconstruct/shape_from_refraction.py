@@ -22,7 +22,7 @@ from refref_jax.optics.media import INDEX_OF_AIR
 from refref_jax.reconstruct import ReconstructionError, families, gauss_newton, photometry
 from refref_jax.reconstruct.gauss_newton import Candidate, Fit, Matrix, Rows, StepFacts, Steps
 from refref_jax.reconstruct.model_selection import Trial, judged
-from refref_jax.reconstruct.photometry import Backdrop, Body, Photographs
+from refref_jax.reconstruct.photometry import Backdrop, Photographs, TracedObject
 from refref_jax.reconstruct.refractive_index import (
     Descent,
     IndexEstimate,
@@ -207,16 +207,16 @@ class _Glass:
     def __init__(self, mesh: Mesh, surface: Backdrop, pixels: Photographs, seed: int) -> None:
         """Builds the scene once, for all indices."""
         self.model = SingleObject(FixedShape(mesh), INDEX_OF_AIR, deviation=1.0)
-        self.body = gauss_newton.body_of(self.model.pose(self.model.start()))
+        self.traced = gauss_newton.traced_object(self.model.pose(self.model.start()))
         self.surface = surface
         self.few = pixels.chosen(_spread(len(pixels.views), _LOOK, seed))
         self.many = pixels.chosen(_spread(len(pixels.views), 4 * _LOOK, seed))
 
-    def at(self, index: float) -> Body:
+    def at(self, index: float) -> TracedObject:
         """Returns the scene with an index."""
-        scene = self.body.scene
+        scene = self.traced.scene
         interfaces = self.model.pose(np.array([index])).interfaces
-        return self.body._replace(scene=scene._replace(interfaces=interfaces))
+        return self.traced._replace(scene=scene._replace(interfaces=interfaces))
 
     def error(self, index: float, blur: int) -> float:
         """Returns the mean error at an index."""
@@ -384,11 +384,11 @@ def first_blur(candidate: Candidate, surface: Backdrop, pixels: Photographs) -> 
     A blur alone makes errors, since photographs are not blurred. Where the shape is so wrong that
     light ends beyond the detail of the backdrop, errors are many times larger.
     """
-    body = gauss_newton.body_of(candidate)
-    sharp = photometry.predict(body, surface, pixels.rays).linear
+    traced = gauss_newton.traced_object(candidate)
+    sharp = photometry.predict(traced, surface, pixels.rays).linear
     most = len(surface.mips) - 2
     for halvings in range(1, most + 1):
-        seen = photometry.predict(body, photometry.blurred(surface, halvings), pixels.rays).linear
+        seen = photometry.predict(traced, photometry.blurred(surface, halvings), pixels.rays).linear
         added = np.abs(photometry.residuals(seen, photometry.encode(sharp))).mean()
         error = np.abs(photometry.residuals(seen, pixels.rgb)).mean()
         if error <= _ENOUGH * added:

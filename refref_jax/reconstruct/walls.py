@@ -201,7 +201,7 @@ class Stretch(NamedTuple):
     turned: Turned
 
     def reversed(self) -> "Stretch":
-        """Returns the same from the end to the beginning, of a body on the other side."""
+        """Returns the same from the end to the beginning, of a solid on the other side."""
         points, by_points, normals, by_normals = (each[::-1] for each in self.turned)
         return Stretch(Turned(points, by_points, -normals, -by_normals))
 
@@ -335,7 +335,7 @@ def places(points: Curve, count: int) -> Float[np.ndarray, " count"]:
 
 
 def inset(profile: Profile, distance: float, size: float) -> Profile | None:
-    """Returns the curve at a distance inside a profile that encloses the largest body.
+    """Returns the curve at a distance inside a profile that encloses the largest area.
 
     It is the contour of the distance from the profile, so it has no loops where the profile bends
     more sharply than the distance, or is narrow.
@@ -343,7 +343,7 @@ def inset(profile: Profile, distance: float, size: float) -> Profile | None:
     Args:
       profile: profile that begins and ends on the axis.
       distance: distance, world units.
-      size: diameter of the body.
+      size: diameter of the object.
 
     Returns:
       The curve; `None` if nothing is further inside.

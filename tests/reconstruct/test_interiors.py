@@ -90,7 +90,7 @@ def test_parts_are_closed_nested_and_apart(vessel, seed):
         assert each.parent == 0
         assert outside(each.mesh.vertices).max() < 0.0
     if len(solids) == 3:
-        liquid, air = (each.mesh.vertices @ vessel.body.axis.frame[:, 2] for each in solids[1:])
+        liquid, air = (each.mesh.vertices @ vessel.outer.axis.frame[:, 2] for each in solids[1:])
         assert liquid.max() < air.min()
 
 
@@ -116,7 +116,7 @@ def test_the_number_of_faces_does_not_depend_on_the_level(body):
 def test_levels_are_horizontal_where_they_should_be(body):
     vessel = Vessel(body, _FLASK, _TINY)
     _, liquid, air = vessel.solids(vessel.start())
-    up, height = vessel.body.axis.frame[:, 2], vessel.body.axis.point[2]
+    up, height = vessel.outer.axis.frame[:, 2], vessel.outer.axis.point[2]
     assert (liquid.mesh.vertices @ up).max() == pytest.approx(height - 0.2, abs=1e-6)
     assert (air.mesh.vertices @ up).min() == pytest.approx(height - 0.1, abs=1e-6)
     assert (liquid.name, liquid.index, liquid.tint) == ("liquid", 1.36, (0.5, 0.8, 0.95))
@@ -139,7 +139,7 @@ def test_what_can_not_be_a_vessel_is_refused(body):
 
 
 def test_hypotheses_begin_with_the_simplest(body):
-    found = hypotheses(body, SearchSettings(levels=3, walls=(0.05, 0.1)))
+    found = hypotheses(body, SearchSettings(levels=3, thicknesses=(0.05, 0.1)))
     names = list(dict.fromkeys(each.name for each in found))
     assert names == ["none", "air", "liquid", "liquid and air"]
     assert [sum(each.name == name for each in found) for name in names] == [1, 2, 2, 6]
@@ -178,7 +178,9 @@ def photographs(body, surface, small_tiles):
     del small_tiles
     rays, views = lit_scenes.pixels(1024, reach=0.6)
     vessel = Vessel(body, _FLASK, _SMALL)
-    seen = photometry.predict(gauss_newton.body_of(vessel.pose(vessel.start())), surface, rays)
+    seen = photometry.predict(
+        gauss_newton.traced_object(vessel.pose(vessel.start())), surface, rays
+    )
     rgb = np.asarray(jnp.clip(pixels.linear_to_srgb(jnp.asarray(seen.linear)), 0.0, 1.0))
     return Photographs(jax.device_get(rays), rgb.astype(np.float64), views)
 
