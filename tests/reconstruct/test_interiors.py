@@ -176,7 +176,7 @@ def small_tiles():
 def photographs(body, surface, small_tiles):
     """Pixels of the flask, without noise."""
     del small_tiles
-    rays, views = lit_scenes.pixels(1024, reach=0.6)
+    rays, views = lit_scenes.pixels(4096, reach=0.6)
     vessel = Vessel(body, _FLASK, _SMALL)
     seen = photometry.predict(
         gauss_newton.traced_object(vessel.pose(vessel.start())), surface, rays
@@ -195,11 +195,11 @@ def test_a_look_finds_the_tint_and_prefers_the_truth(body, surface, photographs)
 
 
 def test_level_index_and_tint_are_recovered(body, surface, photographs):
-    start = dataclasses.replace(_FLASK, level=-0.16, gap=0.08, liquid=1.345, tint=(0.6, 0.8, 0.9))
+    start = dataclasses.replace(_FLASK, level=-0.18, gap=0.09, liquid=1.35, tint=(0.55, 0.8, 0.92))
     vessel = Vessel(body, start, _SMALL)
     layout = vessel.layout
     few = Few(vessel, vessel.start(), np.eye(layout.count)[:, layout.inner.stop :])
-    steps = gauss_newton.Steps((2, 1, 1, 0, 0, 0, 0, 0), 1024, 1024)
+    steps = gauss_newton.Steps((2, 1, 1, 0, 0, 0, 0, 0), 4096, 4096)
     fit = gauss_newton.fit(few, few.start(), surface, photographs, settings=steps)
     found = vessel.interior(few.whole(fit.x))
     assert found.level == pytest.approx(_FLASK.level, abs=0.005)
