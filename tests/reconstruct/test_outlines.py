@@ -48,7 +48,7 @@ def test_errors_say_which_way_the_surface_is_off(outlines, radius, sign):
 
 @pytest.mark.parametrize("free", [False, True], ids=["sphere", "free surface"])
 def test_derivatives_are_central_differences(outlines, free, monkeypatch):
-    """Of points that stay on the surface: a rim that slides over it moves along the line of sight."""
+    """Of points that stay on the surface: a sliding rim moves along the line of sight."""
     ball = Sphere(_ORIGIN, 0.99)
     shape = FreeSurface(bodies.icosphere(3, radius=0.99), 0.3) if free else ball
     model = SingleObject(shape, 1.5)
