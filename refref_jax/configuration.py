@@ -365,7 +365,7 @@ def _with_present_names(
     renamed = {present.get(key, key): item for key, item in value.items()}
     for field in fields:
         former, item = field.metadata.get(FORMER_VALUES, {}), renamed.get(field.name)
-        if isinstance(item, str) and item in former:
+        if isinstance(item, str | int) and item in former:
             renamed[field.name] = former[item]
     return renamed
 

@@ -274,9 +274,12 @@ def filled_up(bvh: BVH) -> BVH:
     The trees of a mesh that moves differ in size: with round numbers, programs that were compiled
     for one of them serve all.
     """
-    tables = _filled(np.asarray(bvh.nodes), axis=1)
-    added = np.arange(bvh_nodes.OCTANTS)[:, None] * (tables.shape[1] - bvh.nodes.shape[1])
-    tables[:, : bvh.nodes.shape[1] - 1, 6] += added.astype(np.int32)  # skip pointers count rows
+    tables, rows = _filled(np.asarray(bvh.nodes), axis=1), bvh.nodes.shape[1]
+    octants = np.arange(bvh_nodes.OCTANTS, dtype=np.int32)[:, None]
+    # Skip pointers count the rows of all tables. Walks that end at the last row pass the spare
+    # ones.
+    tables[:, : rows - 1, 6] += octants * (tables.shape[1] - rows)
+    tables[:, rows - 1 :, 6] = (octants + 1) * tables.shape[1] - 1
     triangles, facets = (_filled(np.asarray(each)) for each in (bvh.triangles, bvh.facets))
     return BVH(host_array(tables), host_array(triangles), host_array(facets))
 

@@ -254,6 +254,18 @@ def test_an_object_in_front_of_the_background_is_seen_in_the_images(space):
     assert few < scene_analysis.MOST_MISFITS < 0.5 * many
 
 
+def test_only_pixels_among_a_mask_are_compared_with_the_background():
+    views, known = _room_views(), {"space": "bounded", "size": 6.0}
+    clean, painted = (_photographs(views, space="bounded", blob=size) for size in (0.0, 0.4))
+    beside = np.all(clean == painted, axis=-1)
+    every, some = (
+        scene_analysis.misfits(views, painted, (), **known, among=among) for among in (None, beside)
+    )
+    assert some < scene_analysis.MOST_MISFITS < 0.5 * every
+    nothing = np.zeros_like(beside)
+    assert scene_analysis.misfits(views, painted, (), **known, among=nothing) == 0.0
+
+
 @pytest.mark.parametrize("space", ["spherical", "bounded"])
 def test_a_wrong_size_of_the_background_is_seen_in_the_images(space):
     views = _room_views()

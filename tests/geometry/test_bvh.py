@@ -134,6 +134,32 @@ def test_packets_and_lockstep_give_the_same_hits(count):
     np.testing.assert_allclose(packets[2], lockstep[2], atol=2e-5)
 
 
+@pytest.mark.parametrize("faces", [0, 1, 12, 300, 1500])
+def test_spare_rows_change_no_hit(faces):
+    tree, slots = bvh_build.build(_soup(faces).astype(np.float32))
+    filled = bvh_build.filled_up(tree)
+    sizes = [(each.nodes.shape[1], len(each.facets)) for each in (tree, filled)]
+    for plain, round_number in zip(*sizes, strict=True):
+        assert round_number == plain + bvh_build.spare_rows(plain)
+        assert bvh_build.spare_rows(round_number) == 0
+    np.testing.assert_array_equal(filled.triangles[: len(slots)], tree.triangles)
+    origins, directions = _random_rays(500)
+    nothing = np.full(500, np.inf, np.float32), np.full(500, bvh.NO_PRIMITIVE, np.int32)
+    rays = [x.astype(np.float32) for x in (origins, directions)]
+    for lockstep in (False, True):
+        plain, spare = (_trace(each, *rays, *nothing, lockstep=lockstep) for each in (tree, filled))
+        jax.tree.map(np.testing.assert_array_equal, plain, spare)
+    assert faces < 300 or np.any(np.isfinite(plain.distances))
+
+
+def test_meshes_of_similar_size_have_trees_of_the_same_shape():
+    sizes = {
+        jax.tree.map(np.shape, bvh_build.filled_up(bvh_build.build(np.float32(_soup(n)))[0]))
+        for n in (1290, 1300, 1310)
+    }
+    assert len(sizes) == 1
+
+
 def test_an_empty_scene_is_missed():
     distances, faces, _ = _closest(np.zeros((0, 3, 3)), *_random_rays(20))
     assert np.all(distances == np.inf)

@@ -69,6 +69,33 @@ def _equations(scene, views, images, *, settings=STRAIGHT, domain=_SKY, **option
     )
 
 
+@pytest.mark.parametrize("share", [1.0, 0.5])
+def test_only_pixels_among_a_mask_have_equations(share):
+    views, empty = _views(), scenes.build()
+    images = np.random.default_rng(0).integers(256, size=(6, 24, 24, 3), dtype=np.uint8)
+    among = np.random.default_rng(1).random((6, 24, 24)) < 0.6
+    among[2] = False
+    # An object in the middle of all views, in a colour that occurs nowhere else.
+    among[:, 8:16, 8:16] = False
+    images[images == 7] = 8
+    images[:, 8:16, 8:16] = 7
+    blocks = _equations(empty, views, images, among=among, share=share, draw=3)
+    seen = np.concatenate([np.round(255.0 * block.srgb) for block in blocks])
+    assert not np.any(seen == 7.0)
+    names = np.concatenate([block.views for block in blocks])
+    counts = among.sum(axis=(1, 2))
+    if share == 1.0:
+        np.testing.assert_array_equal(np.bincount(names, minlength=6), counts)
+        np.testing.assert_array_equal(np.sort(seen, axis=0), np.sort(images[among], axis=0))
+        whole = _equations(empty, views, images)
+        assert sum(len(block.srgb) for block in whole) == among.size
+    else:
+        assert 0.4 * counts.sum() < len(names) < 0.6 * counts.sum() and 2 not in names
+    for block in blocks:
+        assert len(block.lookups.pixels) == len(block.srgb)
+        assert np.all(np.asarray(block.lookups.pixels) < len(block.srgb))
+
+
 def _solve(blocks, iterations=16, **options):
     *_, last = backdrop_solver.solve(
         blocks, space="unbounded", resolution=_RESOLUTION, iterations=iterations, **options

@@ -124,7 +124,6 @@ def test_a_backdrop_has_a_size_and_a_number_of_iterations():
         ("clear", {"far_field": "field", "iterations": 8}, "iterations=8 has no effect"),
         ("clear", {"interior": "field", "iterations": 8}, "iterations=8 has no effect"),
         ("clear", {"far_field": "backdrop", "contraction": "always"}, "contraction=always"),
-        ("clear", {"far_field": "backdrop", "pixels": "background"}, "pixels=background"),
         ("clear", {"far_field": "backdrop", "paths": "straight"}, "straight rays"),
         ("clear", {"far_field": "backdrop", "backdrop_resolution": 3}, "backdrop_resolution is 3"),
         ("clear", {"far_field": "backdrop", "backdrop_resolution": 8193}, "Give 4 to 8192"),
@@ -133,6 +132,23 @@ def test_a_backdrop_has_a_size_and_a_number_of_iterations():
 def test_a_backdrop_is_refused_where_the_scene_needs_a_field(found, given, message):
     with pytest.raises(ValueError, match=message):
         _resolve({"clear": _CLEAR, "untold": _UNTOLD}[found], **given)
+
+
+@pytest.mark.parametrize(
+    ("stated", "share", "expected"),
+    [("scene.json", 0.0, "backdrop"), ("scene.json", 0.5, "field"), ("", 0.0, "field")],
+)
+def test_a_background_beside_the_objects_may_be_a_backdrop(stated, share, expected):
+    facts = SceneFacts(
+        _EMPTY, CAMERAS, (), None, None, (), stated=stated, misfits=lambda **bounds: share
+    )
+    asked = TrainConfig().override(pixels="background", paths="straight")
+    made = resolve(asked, facts)
+    assert made.config.model.far_field == expected
+    assert (made.model.config.backdrop is not None) == (expected == "backdrop")
+    assert made.config.scene.pixels == "background"
+    field = resolve(asked.override(far_field="field"), facts)
+    assert field.model.config.backdrop is None
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,6 @@ import functools
 import json
 import shutil
 import sys
-from types import SimpleNamespace
 
 import imageio.v3 as iio
 import numpy as np
@@ -23,9 +22,11 @@ from experiments.r3f import (
 from experiments.r3f.records import ReconstructionConfig
 from refref_jax.data import meshes, scene_folder
 from refref_jax.geometry.triangle_meshes import corner_normals
-from refref_jax.reconstruct.light_refinement import Refined
+from refref_jax.reconstruct.gauss_newton import Fit
 from refref_jax.reconstruct.mesh_distance import compare_meshes
 from refref_jax.reconstruct.refractive_index import Descent, IndexEstimate
+from refref_jax.reconstruct.shape_from_refraction import SingleObject, Trial
+from refref_jax.reconstruct.shapes import FixedShape
 from tests.factories import bodies
 from tests.factories.silhouettes import RADIUS, without_masks, write_scene
 
@@ -244,7 +245,7 @@ def _estimate(index, deviation):
 def test_an_index_that_is_not_given_is_estimated_once(scene, tmp_path, monkeypatch):
     asked = []
 
-    def estimate(folder_of_scene, mesh, folder, *, seed, space, radius):
+    def estimate(folder_of_scene, mesh, folder, *, seed, space, radius, centre):
         assert (space, radius) == ("unbounded", 2.5)
         assert folder_of_scene == scene and folder.is_dir() and len(mesh.faces) > 100
         asked.append(seed)
@@ -262,66 +263,170 @@ def test_an_index_that_is_not_given_is_estimated_once(scene, tmp_path, monkeypat
     assert chain.read_part(tmp_path / "out").index == 1.48
 
 
+def _trial(name, mesh, index, errors):
+    """A shape that was fitted, without its fit."""
+    fit = Fit(np.full(1, index), np.full((1, 1), 1e-6), ())
+    return Trial(name, SingleObject(FixedShape(mesh), index), fit, np.asarray(errors))
+
+
+_VIEWS = 1e-3 * np.linspace(-1.0, 1.0, 5)
+
+
+def _stub_light(monkeypatch, *, after, growth=1.001, index=1.51):
+    """Replaces what learns and fits, which is tested elsewhere; returns what it is called with."""
+    called = []
+
+    def fit(scene, mesh, known, surface, seen, *, seed):
+        called.append((known.index, surface, seen.split, seed))
+        before = _trial("masks", mesh, known.index, 0.04 + _VIEWS)
+        grown = mesh._replace(vertices=growth * mesh.vertices)
+        return before, _trial("sphere", grown, index, after + _VIEWS)
+
+    monkeypatch.setattr(light_stage, "fit", fit)
+    monkeypatch.setattr(light_stage, "draw", lambda path, *_: path.write_bytes(b"figure"))
+    monkeypatch.setattr(index_stage, "learn_background", lambda *_, **options: "background")
+    monkeypatch.setattr(index_stage, "backdrop_of", lambda folder, model: "surface")
+    return called
+
+
+def _with_validation(scene, target):
+    judged = target / scene.name
+    shutil.copytree(scene, judged)
+    shutil.copy(judged / "transforms_test.json", judged / "transforms_val.json")
+    return judged
+
+
+_LIT = dataclasses.replace(_CONFIG, refinement="light")
+
+
 @pytest.mark.parametrize(("after", "kept"), [(0.03, True), (0.05, False)])
 def test_light_is_kept_only_where_validation_views_say_so(
     scene, whole, tmp_path, monkeypatch, after, kept
 ):
-    """What learns and descends is tested elsewhere; here only what is done with its results."""
-    out, judged = tmp_path / "out", tmp_path / scene.name
+    out, judged = tmp_path / "out", _with_validation(scene, tmp_path)
     shutil.copytree(whole, out)
-    shutil.copytree(scene, judged)
-    shutil.copy(judged / "transforms_test.json", judged / "transforms_val.json")
-    config = dataclasses.replace(_CONFIG, light_steps=7)
     old = object_source.read_mesh(out, records.read(out))
-    looked, errors = [], [0.04, after]
-
-    def look(folder, split, model, *, seed, rays):
-        looked.append((split, seed))
-        return index_stage.ObjectPixels(SimpleNamespace(rgb=np.zeros(rays)), None)
-
-    def refine_by_light(mesh, index, interfaces, evidence, *, config, settings, progress):
-        assert settings.steps == 7 and index == 1.5 and interfaces.index_inside.shape == (1,)
-        assert settings.index_stride == 0.0
-        return Refined(mesh._replace(vertices=1.001 * mesh.vertices), 1.5, (0.04,) * 7, 0.02)
-
-    monkeypatch.setattr(index_stage, "look", look)
-    monkeypatch.setattr(light_stage, "refine_by_light", refine_by_light)
-    monkeypatch.setattr(light_stage, "judge", lambda *_: errors.pop(0))
-    background = SimpleNamespace(config=None)
-    monkeypatch.setattr(index_stage, "learn_background", lambda *_, **options: background)
+    called = _stub_light(monkeypatch, after=after)
     for _ in range(2):
-        found = _run(judged, out, config, compare=False)
-    assert looked == [("val", 1), ("train", 0)]
+        found = _run(judged, out, _LIT, compare=False)
+    assert called == [(1.5, "surface", "val", 0)]
     facts = found.light
-    assert (facts.kept, facts.before, facts.after, facts.steps) == (kept, 0.04, after, 7)
+    assert (facts.kept, facts.shape) == (kept, "sphere" if kept else "masks")
+    assert facts.before == pytest.approx(0.04)
+    assert facts.after == pytest.approx(0.03 if kept else 0.04)
+    assert [trial.shape for trial in facts.trials] == ["masks", "sphere"]
+    assert min(trial.worse for trial in facts.trials) == 0.0
+    assert max(trial.worse for trial in facts.trials) == pytest.approx(0.01)
     part = chain.read_part(out)
     grown = np.ptp(part.vertices) / np.ptp(old.vertices)
     assert grown == pytest.approx(1.001 if kept else 1.0)
     told = (out / "report.md").read_text()
-    assert ("(light/ball_glass.ply)" in told) == kept and ("; discarded" in told) != kept
+    assert ("(light/ball_glass.ply)" in told) == kept
+    assert ("stays as it is, since no shape explains the judges" in told) != kept
+    assert ("| **sphere** | 1 | 0.0300 | 0.0000 ± 0.0000 |" in told) == kept
+    assert "worse than the best" in told and "judged by validation views" in told
+    assert "(light/errors.png)" in told and (out / "light" / "errors.png").is_file()
     # The index was given, so that light leaves it alone.
     assert json.loads((out / "index.json").read_text())["index"] == part.index == 1.5
     if kept:
         (out / "light" / "ball_glass.ply").unlink()
         with pytest.raises(ValueError, match="not finished"):
             chain.read_part(out)
-        errors += [0.04, after]
-        assert _run(judged, out, config, compare=False) == found
+        assert _run(judged, out, _LIT, compare=False) == found
+
+
+def test_an_estimated_index_is_refined_with_the_surface(scene, whole, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    shutil.copytree(whole, out)
+    estimated = dataclasses.replace(_LIT, index=None)
+    begun = dataclasses.replace(
+        records.read(out),
+        config=estimated,
+        index=records.IndexFacts("estimated", 1.48, 0.01, 0.04),
+        report=None,
+    )
+    records.write(out, begun)
+    _stub_light(monkeypatch, after=0.03)
+    found = _run(scene, out, estimated, compare=False)
+    assert found.light.kept and found.light.split == "train"
+    index = json.loads((out / "index.json").read_text())
+    assert index["source"] == "refined" and index["index"] == 1.51
+    assert index["error"] == pytest.approx(1e-3) and chain.read_part(out).index == 1.51
+    assert "1.5100** ± 0.0010 (one standard deviation), refined" in (out / "report.md").read_text()
 
 
 def test_a_body_that_light_blew_up_is_left_out(scene, monkeypatch, tmp_path):
     mesh = bodies.icosphere(2)
-    blown = Refined(mesh._replace(vertices=1.05 * mesh.vertices), 1.6, (0.04,), 0.05)
-    pixels = index_stage.ObjectPixels(SimpleNamespace(rgb=np.zeros(3)), None)
-    monkeypatch.setattr(index_stage, "look", lambda *_, **options: pixels)
-    monkeypatch.setattr(light_stage, "refine_by_light", lambda *_, **options: blown)
-    errors = [0.04, 0.01]
-    monkeypatch.setattr(light_stage, "judge", lambda *_: errors.pop(0))
+    _stub_light(monkeypatch, after=0.01, growth=1.05)
     known, target = records.IndexFacts("estimated", 1.5, 0.01, 0.04), tmp_path / "a" / "b.ply"
-    facts = light_stage.run(
-        scene, mesh, known, SimpleNamespace(config=None), target, steps=1, seed=0
+    facts = light_stage.run(scene, mesh, known, "surface", target, seed=0)
+    assert not facts.kept and not target.exists() and facts.index == 1.5
+    assert facts.shape == "masks" and facts.remark.startswith("the sphere was rejected: ")
+    assert facts.deviation is None and facts.undetermined == 1.0
+
+
+def test_before_a_field_there_is_no_refinement_by_light(scene, whole, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    shutil.copytree(whole, out)
+    monkeypatch.setattr(index_stage, "learn_background", lambda *_, **options: "background")
+    monkeypatch.setattr(index_stage, "backdrop_of", lambda folder, model: None)
+    monkeypatch.setattr(light_stage, "fit", None)  # would raise
+    found = _run(scene, out, _LIT, compare=False)
+    assert found.light == records.LightFacts(
+        False, 1.5, remark="the background is a field, not a surface at a known place"
     )
-    assert not facts.kept and facts.after < facts.before and not target.parent.exists()
+    assert "There was none, since the background is a field" in (out / "report.md").read_text()
+    assert chain.read_part(out).index == 1.5
+
+
+def test_training_views_judge_where_there_are_no_validation_masks(scene, tmp_path):
+    seen = light_stage.read(scene, seed=0)
+    assert seen.split == "train"
+    assert set(seen.judges.views.tolist()) == {0, 8, 16}
+    assert not np.any(seen.fitted.views % 8 == 0) and len(set(seen.fitted.views.tolist())) == 21
+    other = light_stage.read(_with_validation(scene, tmp_path), seed=0)
+    assert other.split == "val" and len(set(other.judges.views.tolist())) == 5
+    assert len(set(other.fitted.views.tolist())) == 24
+    without_masks(tmp_path / scene.name)  # of all splits
+    with pytest.raises(ValueError, match="masks"):
+        light_stage.read(tmp_path / scene.name, seed=0)
+
+
+@pytest.mark.parametrize(
+    ("target", "options"),
+    [
+        ("refref_jax.data.meshes.write_mesh", {"after": True}),  # before the renaming
+        ("experiments.r3f.light_stage.run", {"after": True}),  # renamed, not recorded
+    ],
+)
+def test_a_refinement_that_is_killed_comes_to_the_same_files(
+    scene, whole, tmp_path, monkeypatch, target, options
+):
+    _stub_light(monkeypatch, after=0.03)
+    for name in ("one", "other"):
+        shutil.copytree(whole, tmp_path / name)
+    _run(scene, tmp_path / "one", _LIT, compare=False)
+    with pytest.MonkeyPatch.context() as patch:
+        module, _, name = target.rpartition(".")
+        patch.setattr(target, _killing(getattr(sys.modules[module], name), **options))
+        with pytest.raises(_KilledError):
+            _run(scene, tmp_path / "other", _LIT, compare=False)
+    assert records.read(tmp_path / "other").light is None
+    with pytest.raises(ValueError, match="not finished"):
+        chain.read_part(tmp_path / "other")
+    _run(scene, tmp_path / "other", _LIT, compare=False)
+    assert _contents(tmp_path / "other") == _contents(tmp_path / "one")
+
+
+@pytest.mark.parametrize(
+    ("steps", "refinement"), [(0, "none"), (1, "light"), (60, "light"), (10_000, "light")]
+)
+def test_reconstructions_of_earlier_versions_are_read(whole, tmp_path, steps, refinement):
+    content = json.loads((whole / "reconstruction.json").read_text())
+    del content["config"]["refinement"]
+    content["config"]["light_steps"] = steps
+    (tmp_path / "reconstruction.json").write_text(json.dumps(content))
+    assert records.read(tmp_path).config.refinement == refinement
 
 
 def test_options_may_change_until_a_stage_has_used_them(scene, tmp_path):
@@ -381,15 +486,7 @@ def test_masks_without_an_inside_are_refused(scene, tmp_path):
         lone[20, 20] = 255
         iio.imwrite(path, lone)
     with pytest.raises(ValueError, match="Use larger images"):
-        index_stage.look(thin, "train", None, seed=0, rays=10)
-
-
-def test_light_asks_for_masks_of_validation_views(scene, tmp_path):
-    without = tmp_path / "cube_smcvx_ball"
-    shutil.copytree(scene, without)
-    with pytest.raises(ValueError, match="transforms_val"):
-        _run(without, tmp_path / "out", dataclasses.replace(_CONFIG, light_steps=1))
-    assert not (tmp_path / "out").exists()
+        index_stage.photographs(thin, "train", seed=0, rays=10)
 
 
 @pytest.mark.slow

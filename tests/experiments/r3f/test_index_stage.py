@@ -2,28 +2,42 @@
 
 import dataclasses
 import functools
+import json
+import shutil
 
 import numpy as np
 import pytest
 
 from experiments.r3f import index_stage
-from refref_jax.data import meshes
+from refref_jax.data import meshes, scene_analysis, scene_folder
 from refref_jax.data.scene_assembly import shaded_mesh
 from refref_jax.reconstruct.refractive_index import IndexSearch
 from refref_jax.render import checkpoint_io
-from refref_jax.training import fit, run_folder
+from refref_jax.training import backdrop_equations, fit, run_folder
 from refref_jax.training.loop import init_state
 from refref_jax.training.resolve import read_facts, resolve
 
 pytestmark = [pytest.mark.loose, pytest.mark.computing]
 
 
+def _unstated(scene, folder):
+    """The scene without a statement of what is behind the object, which is learned as a field."""
+    copy = shutil.copytree(scene, folder / "ball")
+    content = json.loads((copy / "scene.json").read_text())
+    del content["background"]
+    (copy / "scene.json").write_text(json.dumps(content))
+    return copy
+
+
+_SEARCH = functools.partial(IndexSearch, 1.47, 1.53, spacing=0.03, descents=1, most=4)
+
+
 @pytest.mark.slow
 def test_a_background_is_learned_beside_the_body_and_once(ball_scene, tmp_path, monkeypatch):
     (part,) = meshes.read_meshes(ball_scene)
     mesh = shaded_mesh(part)
-    search = functools.partial(IndexSearch, 1.47, 1.53, spacing=0.03, descents=1, most=4)
-    monkeypatch.setattr(index_stage, "IndexSearch", search)
+    monkeypatch.setattr(index_stage, "IndexSearch", _SEARCH)
+    monkeypatch.setattr(index_stage, "RAYS", 512)
     kept = []
     sampler = fit.PixelSampler
 
@@ -32,16 +46,60 @@ def test_a_background_is_learned_beside_the_body_and_once(ball_scene, tmp_path, 
         return sampler(*arguments, **options)
 
     monkeypatch.setattr(fit, "PixelSampler", note)
-    look = functools.partial(
-        index_stage.run, ball_scene, mesh, tmp_path, seed=3, start=1.49, steps=300, rays=512
+    scene = _unstated(ball_scene, tmp_path)
+    estimate = functools.partial(
+        index_stage.run, scene, mesh, tmp_path, seed=3, start=1.49, steps=300
     )
-    first, again = look(), look()
+    first, again = estimate(), estimate()
     assert first == again and len(kept) == 1
     config = run_folder.read_config(tmp_path / "background")
     assert (config.scene.pixels, config.paths.name, config.seed) == ("background", "straight", 3)
+    assert config.model.far_field == "field"
     assert 0.2 < kept[0].mean() < 0.95
     assert first.index == pytest.approx(1.5, abs=0.01) and np.isfinite(first.deviation)
     assert len(first.descents) == 2 and (tmp_path / "index.png").stat().st_size > 5000
+
+
+@pytest.mark.slow
+def test_a_backdrop_is_solved_beside_the_body_and_the_index_found_before_it(
+    ball_scene, tmp_path, monkeypatch
+):
+    (part,) = meshes.read_meshes(ball_scene)
+    monkeypatch.setattr(index_stage, "IndexSearch", _SEARCH)
+    monkeypatch.setattr(index_stage, "MANY_RAYS", 6000)
+    among, solve = [], backdrop_equations.read
+
+    def note(*arguments, **options):
+        among.append(options["among"])
+        return solve(*arguments, **options)
+
+    monkeypatch.setattr(backdrop_equations, "read", note)
+    estimate = functools.partial(
+        index_stage.run, ball_scene, shaded_mesh(part), tmp_path, seed=3, start=1.49
+    )
+    first, again = estimate(), estimate()
+    assert first == again and len(among) == 1
+    config = run_folder.read_config(tmp_path / "background")
+    assert (config.scene.pixels, config.model.far_field) == ("background", "backdrop")
+    # No pixel that sees the object is solved for.
+    masks = scene_folder.read_masks(scene_folder.read_frames(ball_scene, "train"))
+    assert not np.any(among[0] & masks) and among[0].mean() > 0.2
+    assert first.index == pytest.approx(1.5, abs=3e-3) and 0.0 < first.deviation < 3e-3
+    assert len(first.descents) == 2 and (tmp_path / "index.png").stat().st_size > 5000
+
+
+def test_a_background_that_was_begun_as_a_field_stays_one(ball_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(fit, "train", lambda run, **options: False)
+    learn = functools.partial(index_stage.learn_background, ball_scene, tmp_path, seed=3)
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(scene_analysis, "MOST_MISFITS", -1.0)
+        patch.setattr(scene_analysis, "misfits", lambda *_, **options: 0.5)
+        learn()
+    begun = run_folder.read_config(tmp_path / "background")
+    assert begun.model.far_field == "field"
+    with pytest.raises(KeyboardInterrupt):
+        learn()
+    assert run_folder.read_config(tmp_path / "background") == begun
 
 
 def test_a_background_that_was_begun_with_other_walls_is_not_taken(
@@ -69,7 +127,8 @@ def test_a_background_suits_the_search_for_the_index_and_its_configuration_is_tr
         return True
 
     monkeypatch.setattr(fit, "train", train_nothing)
-    learn = functools.partial(index_stage.learn_background, ball_scene, tmp_path, seed=3)
+    scene = _unstated(ball_scene, tmp_path)
+    learn = functools.partial(index_stage.learn_background, scene, tmp_path, seed=3)
     model = learn()
     assert (model.config.interior, model.config.footprint) == ("clear", "cone")
     run = tmp_path / "background"

@@ -1,0 +1,93 @@
+"""Equations of outlines: against central differences, and which way they pull."""
+
+import numpy as np
+import pytest
+
+from refref_jax.optics.interface_rules import NO_PARENT, nested
+from refref_jax.reconstruct import outlines as outlines_module
+from refref_jax.reconstruct.families import Sphere
+from refref_jax.reconstruct.gauss_newton import Candidate
+from refref_jax.reconstruct.masks import Views
+from refref_jax.reconstruct.outlines import Outlines
+from refref_jax.reconstruct.shape_from_refraction import SingleObject
+from refref_jax.reconstruct.shapes import FixedShape, FreeSurface
+from tests.factories import bodies
+
+_ORIGIN = np.zeros(3)
+
+
+@pytest.fixture(scope="module")
+def outlines():
+    cameras = bodies.cameras_around(8, size=120, distance=3.0)
+    return Outlines(Views(bodies.masks_of(bodies.ball, cameras), cameras))
+
+
+def _rows(outlines, shape, x=None):
+    model = SingleObject(shape, 1.5)
+    return outlines(model.pose(model.start() if x is None else x))
+
+
+def test_a_ball_that_fits_has_small_errors(outlines):
+    rows = _rows(outlines, Sphere(_ORIGIN, 1.0))
+    assert 8 * 60 <= len(rows.errors) <= 8 * 100
+    # A distance is off by less than a third of a pixel, which is the unit.
+    assert np.sqrt(np.mean(rows.errors**2)) < 1.0 and abs(rows.errors.mean()) < 0.4
+    assert np.all(rows.weights > 0.3) and np.all(rows.weights <= 1.0)
+
+
+@pytest.mark.parametrize(("radius", "sign"), [(0.98, -1.0), (1.02, 1.0)])
+def test_errors_say_which_way_the_surface_is_off(outlines, radius, sign):
+    rows = _rows(outlines, Sphere(_ORIGIN, radius))
+    # A point within the mask has a negative distance, and a larger radius takes it outwards.
+    assert np.mean(sign * rows.errors > 0.0) > 0.9
+    by_radius = rows.derivatives[:, 3]
+    assert np.all(by_radius > 0.0)
+    step = -(rows.weights * by_radius) @ rows.errors / ((rows.weights * by_radius) @ by_radius)
+    assert radius + step == pytest.approx(1.0, abs=3e-3)
+
+
+@pytest.mark.parametrize("free", [False, True], ids=["sphere", "free surface"])
+def test_derivatives_are_central_differences(outlines, free, monkeypatch):
+    """Of points that stay on the surface: a sliding rim moves along the line of sight."""
+    ball = Sphere(_ORIGIN, 0.99)
+    shape = FreeSurface(bodies.icosphere(3, radius=0.99), 0.3) if free else ball
+    model = SingleObject(shape, 1.5)
+    begin, rims, find = model.start(), {}, outlines_module._rim
+
+    def keep(vertices, normals, edges, camera):
+        return rims.setdefault(tuple(camera), find(vertices, normals, edges, camera))
+
+    monkeypatch.setattr(outlines_module, "_rim", keep)
+    direction = np.random.default_rng(2).normal(size=begin.size)
+    step = 1e-6
+    rows, *beside = (outlines(model.pose(begin + t * direction)) for t in (0.0, step, -step))
+    slopes = (beside[0].errors - beside[1].errors) / (2.0 * step)
+    # Distances are interpolated bilinearly: few points are at a kink.
+    off = np.abs(rows.derivatives @ direction - slopes)
+    assert np.quantile(off, 0.99) < 1e-4 * np.abs(slopes).max() and np.abs(slopes).max() > 10.0
+
+
+def test_points_far_from_the_outline_are_of_another_edge(outlines):
+    # A ball of half the size ends tens of pixels within the masks.
+    rows = _rows(outlines, Sphere(_ORIGIN, 0.5))
+    assert len(rows.errors) == 0 and rows.derivatives.shape == (0, 5)
+
+
+def test_an_outline_without_unknowns_moves_nothing(outlines):
+    rows = _rows(outlines, FixedShape(bodies.icosphere(3)))
+    assert len(rows.errors) > 100 and rows.derivatives.shape == (len(rows.errors), 1)
+    assert not rows.derivatives.toarray().any()
+
+
+def test_inner_parts_have_no_outline(outlines):
+    outer, inner = (
+        SingleObject(Sphere(_ORIGIN, radius), 1.5).pose(np.array([0.0, 0.0, 0.0, radius, 1.5]))
+        for radius in (1.0, 0.4)
+    )
+    both = Candidate(
+        (*outer.parts, *inner.parts),
+        nested([1.5, 1.3], [NO_PARENT, 0]),
+        outer.by_indices,
+        outer.by_tints,
+    )
+    np.testing.assert_array_equal(outlines(both).errors, outlines(outer).errors)
