@@ -187,9 +187,9 @@ def _refined(scene: Path, out: Path, found: Reconstruction, say: Say) -> Reconst
         records.write(out, found)
     if found.light is not None:
         say(_describe_light(found.light))
-    if found.index.source == "estimated" and found.index.error is None:
-        if found.light is None or not found.light.kept:
-            _refuse_index(out, found.index.index)
+    refined = found.light is not None and found.light.kept
+    if found.index.source == "estimated" and found.index.error is None and not refined:
+        _refuse_index(out, found.index.index)
     return found
 
 

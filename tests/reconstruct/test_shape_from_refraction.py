@@ -20,9 +20,10 @@ from refref_jax.reconstruct import (
 )
 from refref_jax.reconstruct.families import Sphere
 from refref_jax.reconstruct.gauss_newton import Candidate, Fit, Steps
+from refref_jax.reconstruct.model_selection import Trial, choose, compare, normal_deviations
 from refref_jax.reconstruct.photometry import Photographs, make_backdrop
 from refref_jax.reconstruct.refractive_index import IndexSearch
-from refref_jax.reconstruct.shape_from_refraction import SingleObject, Trial, choose, compare
+from refref_jax.reconstruct.shape_from_refraction import SingleObject
 from refref_jax.reconstruct.shapes import FixedShape, FreeSurface, Posed, mesh_of
 from refref_jax.render import backdrop
 from refref_jax.sampling.scene_bounds import Domain
@@ -173,7 +174,7 @@ def _ball_mesh(ball):
 def test_predictions_are_those_of_a_ball_in_closed_form(glass, space):
     surface = _world(space)
     rays, _ = _rays(4)
-    found = photometry.predict(gauss_newton.body_of(glass.pose(glass.start())), surface, rays)
+    found = photometry.predict(gauss_newton.traced_object(glass.pose(glass.start())), surface, rays)
     away = np.abs(found.linear - _see_ball(surface, rays)).max(axis=-1)
     assert np.median(away) < 0.003 and np.quantile(away, 0.97) < 0.02
     np.testing.assert_allclose(found.dropped, 0.0, atol=1e-6)
@@ -232,7 +233,7 @@ def _changed(ball, kind, t):
 
 def _slopes_of(candidate, surface, rays):
     """The derivatives of the pixels' linear RGB, and where they are to be used."""
-    body = gauss_newton.body_of(candidate)
+    body = gauss_newton.traced_object(candidate)
     predicted = photometry.predict(body, surface, rays)
     found = photometry.sensitivities(body, surface, rays, predicted)
     coordinates = gauss_newton._by_unknowns(candidate, body, found)
@@ -257,7 +258,7 @@ def test_sensitivities_are_central_differences_of_predictions(world, ball, kind,
     assert found.usable.mean() > 0.99 and np.all(found.crossings[found.usable] == 2)
     np.testing.assert_allclose(found.coverage, 9.0, rtol=1e-5)
     there, here = (
-        photometry.predict(gauss_newton.body_of(_changed(ball, kind, t)), world, rays).linear
+        photometry.predict(gauss_newton.traced_object(_changed(ball, kind, t)), world, rays).linear
         for t in (step, -step)
     )
     expected = (there - here)[found.usable].ravel() / (2.0 * step)
@@ -272,14 +273,14 @@ def test_handles_of_a_free_surface_have_the_slopes_of_predictions(world, ball):
     random = np.random.default_rng(5).normal(size=len(model.start()))
     random[-1] = 0.0
     candidate = model.pose(model.start())
-    body = gauss_newton.body_of(candidate)
+    body = gauss_newton.traced_object(candidate)
     found = photometry.sensitivities(body, world, rays, photometry.predict(body, world, rays))
     coordinates = gauss_newton._by_unknowns(candidate, body, found) @ random
     slopes = np.einsum("rkc,rk->rc", found.slopes, coordinates.reshape(-1, 3))[found.usable]
     step = 5e-4
     there, here = (
         photometry.predict(
-            gauss_newton.body_of(model.pose(model.start() + t * random)), world, rays
+            gauss_newton.traced_object(model.pose(model.start() + t * random)), world, rays
         ).linear[found.usable]
         for t in (step, -step)
     )
@@ -371,12 +372,12 @@ def test_a_free_surface_loses_a_dent_that_no_outline_shows(world, ball, seen, ju
     before, after = _turned(mesh), _turned(model.mesh(found.x))
     assert before > 0.5 and after < 0.4 * before
     errors = [
-        gauss_newton.errors_of(gauss_newton.body_of(model.pose(x)), world, judges).mean()
+        gauss_newton.errors_of(gauss_newton.traced_object(model.pose(x)), world, judges).mean()
         for x in (model.start(), found.x)
     ]
     assert errors[1] < 0.5 * errors[0]
     trial = Trial("free surface", model, found, np.array(errors))
-    deviations = shape_from_refraction.normal_deviations(trial)
+    deviations = normal_deviations(trial)
     assert np.all(np.isfinite(deviations)) and 0.0 < np.median(deviations) < 1.0
 
 
@@ -396,8 +397,8 @@ def test_a_family_is_chosen_where_it_explains_the_judges(world, ball, seen, judg
     assert [trial.name for trial in trials] == ["masks", "sphere", "free surface"]
     chosen = choose(trials)
     assert chosen.name == "sphere" and chosen.error < 0.3 * trials[0].error
-    assert chosen.index == pytest.approx(_INDEX, abs=2e-3)
-    assert 0.0 < np.sqrt(chosen.index_variance) < 2e-3
+    assert chosen.outer_index == pytest.approx(_INDEX, abs=2e-3)
+    assert 0.0 < chosen.index_deviation < 2e-3
     assert _turned(chosen.mesh) < 0.2
     assert trials[2].error < 0.5 * trials[0].error
     assert told == sorted(told) and told[-1] == 1.0 and 0.0 < told[0] < 0.2
@@ -413,12 +414,12 @@ def test_before_a_grey_wall_the_body_stays_as_it_is(ball, seen, judges, monkeypa
     trials = shape_from_refraction.fit_shapes(mesh, _INDEX, grey, pixels, others)
     chosen = choose(trials)
     assert chosen is trials[0] and chosen.mesh.vertices is mesh.vertices
-    assert chosen.index == _INDEX
+    assert chosen.outer_index == _INDEX
     for trial in trials:
         assert np.all(np.isfinite(trial.fit.x)) and np.all(np.isfinite(trial.fit.covariance))
         assert np.all(np.isfinite(trial.by_view)) and np.all(np.isfinite(trial.mesh.vertices))
         # Light says nothing: what is known of the index is the prior.
-        assert np.sqrt(trial.index_variance) == pytest.approx(0.02, rel=0.05)
+        assert trial.index_deviation == pytest.approx(0.02, rel=0.05)
 
 
 def test_an_index_that_the_user_gave_stays(world, seen):
@@ -431,7 +432,9 @@ def test_an_index_that_the_user_gave_stays(world, seen):
 def test_tints_are_found_with_the_index(world, seen, ball):
     tint = np.array([0.9, 0.97, 0.8])
     true = SingleObject(ball, _INDEX, tinted=True)
-    body = gauss_newton.body_of(true.pose(np.concatenate([ball.start(), [_INDEX], np.log(tint)])))
+    body = gauss_newton.traced_object(
+        true.pose(np.concatenate([ball.start(), [_INDEX], np.log(tint)]))
+    )
     rgb = photometry.encode(photometry.predict(body, world, seen.rays).linear)
     found = gauss_newton.fit(
         true, true.start(), world, seen._replace(rgb=rgb), settings=Steps(blurs=(0, 0, 0, 0))
@@ -449,7 +452,7 @@ def test_no_pixels_are_refused_with_advice(world, glass, ball, seen):
 
 
 def _equations(candidate, surface, pixels):
-    body = gauss_newton.body_of(candidate)
+    body = gauss_newton.traced_object(candidate)
     return gauss_newton.linearise(candidate, body, surface, pixels, Steps())
 
 

@@ -24,8 +24,9 @@ from refref_jax.data import meshes, scene_folder
 from refref_jax.geometry.triangle_meshes import corner_normals
 from refref_jax.reconstruct.gauss_newton import Fit
 from refref_jax.reconstruct.mesh_distance import compare_meshes
+from refref_jax.reconstruct.model_selection import Trial
 from refref_jax.reconstruct.refractive_index import Descent, IndexEstimate
-from refref_jax.reconstruct.shape_from_refraction import SingleObject, Trial
+from refref_jax.reconstruct.shape_from_refraction import SingleObject
 from refref_jax.reconstruct.shapes import FixedShape
 from tests.factories import bodies
 from tests.factories.silhouettes import RADIUS, without_masks, write_scene
@@ -94,7 +95,7 @@ def test_the_surface_in_the_file_is_what_light_is_traced_through(
 
     monkeypatch.setattr(meshes, "write_mesh", keep)
     geometry_stage.run(scene, tmp_path, _CONFIG)
-    (vertices, faces, normals), body = written[0], chain.read_part(whole)
+    (vertices, faces, normals), body = written[0], chain.read_parts(whole)[0]
     np.testing.assert_array_equal(body.vertices[body.faces], vertices[faces])
     np.testing.assert_array_equal(body.normals, normals)
     assert body.index == 1.5
@@ -260,7 +261,7 @@ def test_an_index_that_is_not_given_is_estimated_once(scene, tmp_path, monkeypat
     report = (tmp_path / "out" / "report.md").read_text()
     assert "1.4800** ± 0.0100" in report
     assert "`--background=unbounded` `--radius=2.5`" in report
-    assert chain.read_part(tmp_path / "out").index == 1.48
+    assert chain.read_parts(tmp_path / "out")[0].index == 1.48
 
 
 def _trial(name, mesh, index, errors):
@@ -317,7 +318,7 @@ def test_light_is_kept_only_where_validation_views_say_so(
     assert [trial.shape for trial in facts.trials] == ["masks", "sphere"]
     assert min(trial.worse for trial in facts.trials) == 0.0
     assert max(trial.worse for trial in facts.trials) == pytest.approx(0.01)
-    part = chain.read_part(out)
+    part = chain.read_parts(out)[0]
     grown = np.ptp(part.vertices) / np.ptp(old.vertices)
     assert grown == pytest.approx(1.001 if kept else 1.0)
     told = (out / "report.md").read_text()
@@ -331,7 +332,7 @@ def test_light_is_kept_only_where_validation_views_say_so(
     if kept:
         (out / "light" / "ball_glass.ply").unlink()
         with pytest.raises(ValueError, match="not finished"):
-            chain.read_part(out)
+            chain.read_parts(out)[0]
         assert _run(judged, out, _LIT, compare=False) == found
 
 
@@ -351,7 +352,7 @@ def test_an_estimated_index_is_refined_with_the_surface(scene, whole, tmp_path, 
     assert found.light.kept and found.light.split == "train"
     index = json.loads((out / "index.json").read_text())
     assert index["source"] == "refined" and index["index"] == 1.51
-    assert index["error"] == pytest.approx(1e-3) and chain.read_part(out).index == 1.51
+    assert index["error"] == pytest.approx(1e-3) and chain.read_parts(out)[0].index == 1.51
     assert "1.5100** ± 0.0010 (one standard deviation), refined" in (out / "report.md").read_text()
 
 
@@ -376,7 +377,7 @@ def test_before_a_field_there_is_no_refinement_by_light(scene, whole, tmp_path, 
         False, 1.5, remark="the background is a field, not a surface at a known place"
     )
     assert "There was none, since the background is a field" in (out / "report.md").read_text()
-    assert chain.read_part(out).index == 1.5
+    assert chain.read_parts(out)[0].index == 1.5
 
 
 def test_training_views_judge_where_there_are_no_validation_masks(scene, tmp_path):
@@ -413,7 +414,7 @@ def test_a_refinement_that_is_killed_comes_to_the_same_files(
             _run(scene, tmp_path / "other", _LIT, compare=False)
     assert records.read(tmp_path / "other").light is None
     with pytest.raises(ValueError, match="not finished"):
-        chain.read_part(tmp_path / "other")
+        chain.read_parts(tmp_path / "other")
     _run(scene, tmp_path / "other", _LIT, compare=False)
     assert _contents(tmp_path / "other") == _contents(tmp_path / "one")
 
@@ -495,13 +496,13 @@ def test_an_estimate_that_is_no_number_is_no_result(scene, tmp_path, monkeypatch
     with pytest.raises(ValueError, match="--ior"):
         _run(scene, tmp_path / "out", dataclasses.replace(_CONFIG, index=None))
     with pytest.raises(ValueError, match="not finished"):
-        chain.read_part(tmp_path / "out")
+        chain.read_parts(tmp_path / "out")[0]
     # What the message advises is taken in the same folder, and only then settled.
     assert _run(scene, tmp_path / "out", _CONFIG).index.source == "given"
     with pytest.raises(ValueError, match=r"ior 1.5, not 1.6"):
         _run(scene, tmp_path / "out", dataclasses.replace(_CONFIG, index=1.6))
     with pytest.raises(ValueError, match="no reconstruction"):
-        chain.read_part(tmp_path)
+        chain.read_parts(tmp_path)
 
 
 def test_the_background_of_an_overlay_is_used_and_other_ambient_media_are_refused(tmp_path):
