@@ -276,7 +276,7 @@ def filled_up(bvh: BVH) -> BVH:
     """
     tables, rows = _filled(bvh.nodes, axis=1), bvh.nodes.shape[1]
     octants = np.arange(bvh_nodes.OCTANTS, dtype=np.int32)[:, None]
-    # Skip pointers count the rows of all tables. Walks that end at the last row pass the spare ones.
+    # Skip pointers count the rows of all tables. Walks end at the last row, beyond the spare ones.
     tables[:, : rows - 1, 6] += octants * (tables.shape[1] - rows)
     tables[:, rows - 1 :, 6] = (octants + 1) * tables.shape[1] - 1
     triangles, facets = _filled(bvh.triangles), _filled(bvh.facets)

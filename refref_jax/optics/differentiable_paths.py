@@ -152,7 +152,7 @@ def find_primitives(
 
     Returns:
       Triangle at each bend, and at the end of the last segment; `NO_PRIMITIVE` where the path does
-      not go on.
+      not continue.
     """
     _, segments, _ = _scan(scene, ray, reflects, settings, None, "cone", None)
     return jnp.where(segments.used, segments.primitive, NO_PRIMITIVE)

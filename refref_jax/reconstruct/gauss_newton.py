@@ -113,7 +113,8 @@ class Steps:
     """Settings of a fit.
 
     Attributes:
-      blurs: blur of the backdrop in each step, as halvings of its resolution (`photometry.blurred`).
+      blurs: blur of the backdrop in each step, in halvings of its resolution
+        (`photometry.blurred`).
       rays: number of pixels of a step.
       judges: number of fresh pixels that decide whether a step is taken.
       outliers: share of the pixels of largest derivatives that are left out.
@@ -375,7 +376,7 @@ def _scattered(
     columns: Int[np.ndarray, "bends 3"],
     shape: tuple[int, int],
 ) -> scipy.sparse.csr_array:
-    """Returns a sparse matrix `[3 rays, 3 columns]` of the blocks of coordinate, corner and axis."""
+    """Returns a matrix `[3 rays, 3 columns]` of the blocks of coordinate, corner and axis."""
     axes = np.arange(3, dtype=np.int32)
     rows = 3 * ray[:, None, None, None].astype(np.int32) + axes[:, None, None]
     places = 3 * columns[:, None, :, None].astype(np.int32) + axes

@@ -3,8 +3,8 @@
 Where the surface turns away from a camera, its image has an edge, and the edge of the mask should
 be there. A point of this rim that moves by `dx` moves its image across the edge by
 `d (signed distance) / d pixel . d pixel / d point . dx`; moving along the line of sight changes
-nothing. Masks are sampled at the centres of pixels, so the distance of a point has an error of about
-a third of a pixel. Masks that are wrong, or show something else, lose their weight.
+nothing. Masks are sampled at the centres of pixels, so the distance of a point has an error of
+about a third of a pixel. Masks that are wrong, or show something else, lose their weight.
 
 Source: Cipolla and Blake, Surface Shape from the Deformation of Apparent Contours (1992), for the
 derivative; its use beside refraction is ours.

@@ -1,8 +1,8 @@
 """Compares photographs with the light of a known backdrop, refracted by an object of unknown shape.
 
 `predict` renders pixels along the whole path tree. `sensitivities` differentiates them: the main
-path of a pixel (refracted wherever it can be) carries the share `T` of its light and ends at a place
-`(u, v)` of the backdrop. With the three *coordinates* `(u, v, T)`,
+path of a pixel (refracted wherever it can be) carries the share `T` of its light and ends at a
+place `(u, v)` of the backdrop. With the three *coordinates* `(u, v, T)`,
 
     d colour / d unknowns = (d colour / d coordinates) (d coordinates / d unknowns).
 
@@ -10,7 +10,7 @@ The first factor is small: differences of the radiance over the pixel's own foot
 the difference between the main path and the pixel's other light, which takes its share. The second
 is exact, and dense only in the corners and normals of the few triangles that the path meets.
 Nothing is ever differentiated through the whole mesh. The sequence of triangles is held fixed, as
-in `differentiable_paths`: a caller traces anew for every linearisation.
+in `differentiable_paths`: a caller traces again for every linearisation.
 
 This is one of the modules that call `jax.jit`.
 
@@ -239,7 +239,11 @@ def residuals(
 
 def encode(linear: Float[np.ndarray, "rays 3"]) -> Float[np.ndarray, "rays 3"]:
     """Returns linear RGB as sRGB in `[0, 1]`."""
-    return np.asarray(jnp.clip(pixels.linear_to_srgb(jnp.asarray(linear)), 0.0, 1.0), np.float64)
+    return np.asarray(_encode(jax.device_put(linear)), np.float64)
+
+
+def _encode(linear: Float[Array, "rays 3"]) -> Float[Array, "rays 3"]:
+    return jnp.clip(pixels.linear_to_srgb(linear), 0.0, 1.0)
 
 
 def _in_tiles(render: Callable[[Rays], _Tree], rays: Rays) -> _Tree:
@@ -290,7 +294,7 @@ def _differentiate(
     radiance = backdrop.radiance(mips, lookups)
     met = primitives[:, :-1] != NO_PRIMITIVE
     kinds = jnp.arange(indices.shape[0], dtype=jnp.int32)
-    crossings = jnp.sum((parts[:, :-1, None] == kinds[None, None]) & met[..., None], axis=1, dtype=jnp.int32)
+    crossed = (parts[:, :-1, None] == kinds[None, None]) & met[..., None]
     cut = lambda x: x[:, :, :-1]  # noqa: E731 - the last cast meets nothing
     found = Sensitivities(
         primitives=primitives[:, :-1],
@@ -299,7 +303,7 @@ def _differentiate(
         by_indices=by_indices,
         slopes=slopes,
         light=radiance,
-        crossings=crossings,
+        crossings=jnp.sum(crossed, axis=1, dtype=jnp.int32),
         coverage=backdrop.radiance(coverage, lookups)[:, 0],
         usable=ends.statuses == PathStatus.ESCAPED,
     )

@@ -326,6 +326,7 @@ def scatter_of_bottoms(
 
 
 def rungs(search: IndexSearch) -> tuple[float, ...]:
+    """Returns the indices of the ladder, the lowest first."""
     count = math.ceil((search.highest - search.lowest) / search.spacing - 1e-9)
     return tuple(float(rung) for rung in np.linspace(search.lowest, search.highest, count + 1))
 

@@ -18,8 +18,8 @@ from trimesh import Trimesh
 from trimesh.remesh import subdivide_to_size
 
 from refref_jax.geometry.triangle_meshes import Mesh, diameter, make_mesh
-from refref_jax.optics.media import INDEX_OF_AIR
 from refref_jax.optics.interface_rules import NO_PARENT, nested
+from refref_jax.optics.media import INDEX_OF_AIR
 from refref_jax.reconstruct import ReconstructionError, families, gauss_newton, photometry
 from refref_jax.reconstruct.gauss_newton import Candidate, Fit, Matrix, Rows, StepFacts, Steps
 from refref_jax.reconstruct.photometry import Backdrop, Body, Photographs
@@ -65,6 +65,8 @@ _LONGEST, _LONG = 0.015, 4.0
 
 # Lengths are stated for bodies of this diameter, world units.
 _STATED_FOR = 2.6
+
+_SEARCH = IndexSearch()
 
 
 class SingleObject:
@@ -153,7 +155,7 @@ def find_index(
     surface: Backdrop,
     pixels: Photographs,
     *,
-    search: IndexSearch = IndexSearch(),
+    search: IndexSearch = _SEARCH,
     start: float | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
     seed: int = 0,
@@ -448,7 +450,7 @@ def compare(trial: Trial, best: Trial) -> Comparison:
 
 
 def choose(trials: Sequence[Trial]) -> Trial:
-    """Returns the trial of fewest unknowns that is not worse than the best by two standard errors."""
+    """Returns the smallest trial that is not worse than the best by two standard errors."""
     best = min(trials, key=lambda trial: trial.error)
     for trial in sorted(trials, key=lambda trial: len(trial.fit.x)):
         worse = compare(trial, best)
