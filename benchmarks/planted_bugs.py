@@ -80,6 +80,8 @@ _TEST_MEDIA = ("optics/test_media.py",)
 _TEST_BOUNDS = ("sampling/test_scene_bounds.py",)
 _TEST_COMPOSITING = ("render/test_compositing.py",)
 _TEST_OBJECTIVE = ("training/test_objective.py",)
+_REFRACTION = "reconstruct/test_shape_from_refraction.py"
+_TEST_REFRACTION = (f"{_REFRACTION}::test_sensitivities_are_central_differences_of_predictions",)
 
 BUGS = (
     Bug(
@@ -377,6 +379,41 @@ BUGS = (
         "return sines * factors * np.roll(factors, 1, axis=1)",
         "return sines * factors",
         ("geometry/test_corner_normals.py",),
+    ),
+    Bug(
+        "spare rows of a tree lead to its beginning",
+        "geometry/bvh_build.py",
+        "tables[:, rows - 1 :, 6] = (octants + 1) * tables.shape[1] - 1",
+        "tables[:, rows - 1, 6] = 0",
+        ("geometry/test_bvh.py::test_the_spare_rows_of_a_tree_lead_to_its_end",),
+    ),
+    Bug(
+        "slope of the radiance of the other axis",
+        "reconstruct/photometry.py",
+        "return jnp.stack([along(0), along(1)], axis=1)",
+        "return jnp.stack([along(1), along(0)], axis=1)",
+        _TEST_REFRACTION,
+    ),
+    Bug(
+        "derivatives by normals left out",
+        "reconstruct/gauss_newton.py",
+        "total = total + turned @ _stacked(",
+        "total = total + 0.0 * turned @ _stacked(",
+        _TEST_REFRACTION,
+    ),
+    Bug(
+        "the best shape is chosen, however little better it is",
+        "reconstruct/shape_from_refraction.py",
+        "if worse.mean <= 2.0 * worse.error:",
+        "if worse.mean <= 0.0 * worse.error:",
+        (f"{_REFRACTION}::test_the_smallest_shape_within_two_standard_errors_is_chosen",),
+    ),
+    Bug(
+        "rows of an image upwards",
+        "reconstruct/outlines.py",
+        "by_row = scale[:, None] * (-up + y[:, None] * back)",
+        "by_row = scale[:, None] * (up + y[:, None] * back)",
+        ("reconstruct/test_outlines.py",),
     ),
     Bug(
         "small pieces decide at a bevel",

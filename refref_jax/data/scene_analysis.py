@@ -251,7 +251,7 @@ def read_misfits(
     space: Space,
     size: float,
     centre: Position,
-    masked: bool = False,
+    masked: bool,
 ) -> float:
     """Returns the share of `misfits` of the training images, of which at most 60 are read.
 

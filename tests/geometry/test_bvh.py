@@ -152,6 +152,20 @@ def test_spare_rows_change_no_hit(faces):
     assert faces < 300 or np.any(np.isfinite(plain.distances))
 
 
+@pytest.mark.parametrize("faces", [1, 300])
+def test_the_spare_rows_of_a_tree_lead_to_its_end(faces):
+    """Else a walk that ends at the last row would never come to it."""
+    nodes = bvh_build.filled_up(bvh_build.build(np.float32(_soup(faces)))[0]).nodes
+    rows = np.arange(nodes[..., 6].size).reshape(nodes.shape[:2])
+    last = np.broadcast_to(rows[:, -1:], rows.shape)
+    spare = nodes[..., 7] < 0
+    assert spare.sum(axis=1).min() > 1
+    np.testing.assert_array_equal(nodes[..., 6][spare], last[spare])
+    # All others lead onwards, within their table.
+    assert np.all(nodes[..., 6][~spare] > rows[~spare])
+    assert np.all(nodes[..., 6][~spare] <= last[~spare])
+
+
 def test_meshes_of_similar_size_have_trees_of_the_same_shape():
     sizes = {
         jax.tree.map(np.shape, bvh_build.filled_up(bvh_build.build(np.float32(_soup(n)))[0]))

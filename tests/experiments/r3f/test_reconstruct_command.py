@@ -20,7 +20,13 @@ def scene(tmp_path_factory):
 @pytest.mark.slow
 def test_the_command_tells_where_its_results_are(scene, tmp_path):
     out = tmp_path / "out"
-    options = (f"--scene={scene}", f"--out={out}", "--ior=1.5", "--resolution=20")
+    options = (
+        f"--scene={scene}",
+        f"--out={out}",
+        "--ior=1.5",
+        "--resolution=20",
+        "--refinement=none",
+    )
     result = run_command("reconstruct", *options)
     for name in ("report.md", "pictures", "geometry/ball_glass.ply", "index.json"):
         assert str(out / name) in result.stdout and (out / name).exists()
@@ -30,7 +36,7 @@ def test_the_command_tells_where_its_results_are(scene, tmp_path):
 
 @pytest.mark.slow
 def test_a_killed_command_comes_to_the_same_files(scene, tmp_path):
-    options = (f"--scene={scene}", "--ior=1.5", "--resolution=32")
+    options = (f"--scene={scene}", "--ior=1.5", "--resolution=32", "--refinement=none")
     run_command("reconstruct", *options, f"--out={tmp_path / 'whole'}")
     out = tmp_path / "killed"
     command = [sys.executable, "-m", "experiments.reconstruct", *options, f"--out={out}"]
