@@ -403,8 +403,8 @@ BUGS = (
     ),
     Bug(
         "the best shape is chosen, however little better it is",
-        "reconstruct/shape_from_refraction.py",
-        "if worse.mean <= 2.0 * worse.error:",
+        "reconstruct/model_selection.py",
+        "if worse.mean <= _WORSE * worse.error:",
         "if worse.mean <= 0.0 * worse.error:",
         (f"{_REFRACTION}::test_the_smallest_shape_within_two_standard_errors_is_chosen",),
     ),

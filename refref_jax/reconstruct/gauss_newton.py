@@ -25,7 +25,7 @@ refracted light; the sparse Jacobian through traced triangles is ours.
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, Protocol, TypeAlias, runtime_checkable
+from typing import Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 import scipy.linalg
@@ -464,7 +464,8 @@ def _without_largest(
     jacobian: Matrix, weights: Float[np.ndarray, "rays 3"], share: float
 ) -> np.ndarray:
     """Returns which rays do not have one of the largest derivatives, as near the critical angle."""
-    squares = jacobian.multiply(jacobian) if scipy.sparse.issparse(jacobian) else jacobian**2
+    matrix: Any = jacobian
+    squares = matrix.multiply(matrix) if scipy.sparse.issparse(matrix) else matrix**2
     size = np.asarray(squares.sum(axis=1)).reshape(-1, 3).sum(axis=1)
     counted = weights[:, 0] > 0.0
     if not counted.any():

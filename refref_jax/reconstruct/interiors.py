@@ -354,6 +354,10 @@ class Vessel:
         down = walls.between(self._inner, inner, self._plan[2], bottom, ends[1]).reversed()
         return [outside, walls.bridge(outside, down), down]
 
+    def index_of(self, x: Float[np.ndarray, " unknowns"]) -> float:
+        """Returns the index of refraction of the glass."""
+        return float(self.interior(x).glass)
+
     def solids(self, x: Float[np.ndarray, " unknowns"]) -> list[Solid]:
         """Returns the parts of the vessel, as those of an ordinary scene.
 

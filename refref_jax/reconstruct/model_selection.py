@@ -7,7 +7,7 @@ differences of their views' errors is above two standard errors.
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import scipy.sparse
@@ -23,6 +23,14 @@ from refref_jax.reconstruct.shapes import mesh_of
 _WORSE = 2.0
 
 
+@runtime_checkable
+class ObjectModel(Model, Protocol):
+    """A model whose outermost part has an index of refraction."""
+
+    def index_of(self, x: Float[np.ndarray, " unknowns"]) -> float:
+        """Returns that index at given unknowns."""
+
+
 class Trial(NamedTuple):
     """One model, fitted.
 
@@ -34,7 +42,7 @@ class Trial(NamedTuple):
     """
 
     name: str
-    model: Model
+    model: ObjectModel
     fit: Fit
     by_view: Float[np.ndarray, " views"]
 
@@ -51,12 +59,12 @@ class Trial(NamedTuple):
     @property
     def outer_index(self) -> float:
         """Index of refraction of the outermost part."""
-        return float(np.asarray(self.candidate.interfaces.index_inside)[0])
+        return self.model.index_of(self.fit.x)
 
     @property
     def index_deviation(self) -> float:
         """Standard deviation of this index."""
-        by = self.candidate.by_indices
+        by: Any = self.candidate.by_indices
         row = (by.toarray() if scipy.sparse.issparse(by) else np.asarray(by))[0]
         return math.sqrt(max(float(row @ self.fit.covariance @ row), 0.0))
 
@@ -66,7 +74,9 @@ class Trial(NamedTuple):
         return mesh_of(self.candidate.parts[0])
 
 
-def judged(name: str, model: Model, fit: Fit, surface: Backdrop, judges: Photographs) -> Trial:
+def judged(
+    name: str, model: ObjectModel, fit: Fit, surface: Backdrop, judges: Photographs
+) -> Trial:
     """Returns a fitted model with the errors of the judges.
 
     Args:
@@ -118,7 +128,7 @@ def choose(trials: Sequence[Trial]) -> Trial:
 
 def normal_deviations(trial: Trial) -> Float[np.ndarray, " normals"]:
     """Returns the standard deviation of each normal of the outermost part, in degrees."""
-    by = trial.candidate.parts[0].by_normals
+    by: Any = trial.candidate.parts[0].by_normals
     spread = by @ trial.fit.covariance
     both = by.multiply(spread) if scipy.sparse.issparse(by) else np.asarray(by) * spread
     variance = np.asarray(both.sum(axis=1)).reshape(-1, 3).sum(axis=1)

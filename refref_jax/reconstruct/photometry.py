@@ -19,13 +19,13 @@ Source: ours. Igehy, Tracing Ray Differentials (1999), for the footprints.
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax import numerics
 from refref_jax.geometry import bvh_build
@@ -110,15 +110,15 @@ class TracedObject(NamedTuple):
 
 
 class Prediction(NamedTuple):
-    """Predicted pixels.
+    """Predicted pixels, as NumPy arrays once a caller has them.
 
     Attributes:
       linear: linear RGB.
       dropped: share of the light that was not followed.
     """
 
-    linear: Float[np.ndarray, "rays 3"]
-    dropped: Float[np.ndarray, " rays"]
+    linear: Float[Any, "rays 3"]
+    dropped: Float[Any, " rays"]
 
 
 class Sensitivities(NamedTuple):
@@ -136,15 +136,15 @@ class Sensitivities(NamedTuple):
       usable: whether the path leaves the object within the number of bends.
     """
 
-    primitives: Int[np.ndarray, "rays bends"]
-    by_corners: Float[np.ndarray, "rays 3 bends 3 3"]
-    by_normals: Float[np.ndarray, "rays 3 bends 3 3"]
-    by_indices: Float[np.ndarray, "rays 3 parts"]
-    slopes: Float[np.ndarray, "rays 3 3"]
-    light: Float[np.ndarray, "rays 3"]
-    crossings: Int[np.ndarray, "rays parts"]
-    coverage: Float[np.ndarray, " rays"]
-    usable: np.ndarray
+    primitives: Int[Any, "rays bends"]
+    by_corners: Float[Any, "rays 3 bends 3 3"]
+    by_normals: Float[Any, "rays 3 bends 3 3"]
+    by_indices: Float[Any, "rays 3 parts"]
+    slopes: Float[Any, "rays 3 3"]
+    light: Float[Any, "rays 3"]
+    crossings: Int[Any, "rays parts"]
+    coverage: Float[Any, " rays"]
+    usable: Bool[Any, " rays"]
 
 
 def assemble(

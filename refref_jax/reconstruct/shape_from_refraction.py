@@ -294,9 +294,7 @@ def fit_shapes(
         fit = task.fit(
             model,
             Steps(blurs, rays=_FAMILY_RAYS, seed=seed),
-            lambda step, facts, begin=begin, label=label: progress(
-                (begin + step) / total, _told(label, facts)
-            ),
+            functools.partial(_report, progress, label, begin, total),
         )
         trials.append(task.judged(shape.name, model, fit))
         done += count + 2
@@ -306,15 +304,31 @@ def fit_shapes(
             task,
             best,
             blur if best is trials[0] else 0,
-            lambda step, facts: progress(min((done + step) / total, 1.0), _told(free.name, facts)),
+            functools.partial(_report, progress, free.name, done, total),
         )
     )
     progress(1.0, "done")
     return tuple(trials)
 
 
-def _told(name: str, facts: StepFacts) -> str:
-    return f"{name}: error {min(facts.before, facts.after):.4f}"
+def _report(
+    progress: Callable[[float, str], None],
+    name: str,
+    before: int,
+    total: int,
+    step: int,
+    facts: StepFacts,
+) -> None:
+    """Reports a step of one shape as a share of all."""
+    error = min(facts.before, facts.after)
+    progress(min((before + step) / total, 1.0), f"{name}: error {error:.4f}")
+
+
+def _later(
+    progress: Callable[[int, StepFacts], None], before: int, step: int, facts: StepFacts
+) -> None:
+    """Reports a step after others."""
+    progress(before + step, facts)
 
 
 class _Task(NamedTuple):
@@ -358,9 +372,7 @@ def _fit_free(
         model = SingleObject(FreeSurface(mesh), index, deviation=task.deviation)
         coarse = tuple(range(blur, 0, -1)) if number == 0 else ()
         settings = Steps((*coarse, *[0] * _GROUPS[number]), seed=task.seed + number)
-        fit = task.fit(
-            model, settings, lambda step, facts, before=done: progress(before + step, facts)
-        )
+        fit = task.fit(model, settings, functools.partial(_later, progress, done))
         done += len(settings.blurs)
         mesh, index = model.mesh(fit.x), model.index_of(fit.x)
     return task.judged(model.shape.name, model, fit)
