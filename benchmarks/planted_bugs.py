@@ -402,7 +402,7 @@ BUGS = (
         _TEST_REFRACTION,
     ),
     Bug(
-        "the best shape is chosen, however little better it is",
+        "the best shape is always chosen",
         "reconstruct/shape_from_refraction.py",
         "if worse.mean <= 2.0 * worse.error:",
         "if worse.mean <= 0.0 * worse.error:",
