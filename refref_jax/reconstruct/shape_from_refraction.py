@@ -7,6 +7,7 @@ explains held-out pixels not significantly worse than the best.
 Source: ours; the paper (arXiv 2505.05848) smooths by hand, and trains the index with the field.
 """
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
