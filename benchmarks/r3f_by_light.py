@@ -9,6 +9,8 @@ its normals and the true ones. The second has the results of training with the r
 with the scene's own meshes: masked PSNR on the test split, with a backdrop and, with
 `--field_steps`, with a field. Finished reconstructions and trainings are reused.
 
+Of a vessel with liquid the level, both indices and the tint are printed, too.
+
 Asserted are the bounds of `_MUST` for the scenes named there, and for all others that light is no
 worse than masks.
 """
@@ -18,6 +20,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 from absl import app, flags
 
 from experiments.cli import subprocesses
@@ -55,8 +58,12 @@ _MUST = {
     "torus": Bounds(0.25, 1.2, 0.003, 32.0),
     "ball": Bounds(0.16, 0.6, 0.001, 34.7),
     "cylinder": Bounds(0.5, 4.0, 0.003, 24.0),
+    "flask": Bounds(180.0, 180.0, 0.01, 25.0),
 }
 """Bounds by object."""
+
+# Largest errors of the level of a liquid, of its index and of its tint.
+_LEVEL, _LIQUID, _TINT = 0.015, 0.01, 0.03
 
 
 class Row(NamedTuple):
@@ -101,6 +108,8 @@ def _measure(scene: Path) -> list[str]:
     masks, light = rows[0], rows[-1]
     if light.error is not None and masks.error is not None and light.error > masks.error:
         return [f"{name}: light is worse than masks"]
+    if found.light is not None and found.light.parts:
+        return _measure_inside(name, out, found, parts)
     must = _MUST.get(name.split("_", 2)[-1])
     if must is None or light.distance is None:
         return []
@@ -110,6 +119,40 @@ def _measure(scene: Path) -> list[str]:
         "index": abs(light.index - parts[0].index) <= must.index,
     }
     return [f"{name}: {what} out of bounds" for what, holds in within.items() if not holds]
+
+
+def _measure_inside(
+    name: str, out: Path, found: Reconstruction, parts: Sequence[meshes.MeshPart]
+) -> list[str]:
+    """Prints what is inside a vessel beside the truth, and returns what is out of bounds."""
+    true, ours = (
+        {_kind(p): p for p in each} for each in (parts, object_source.read_parts(out, found))
+    )
+    if set(true) != set(ours):
+        return [f"{name}: {sorted(ours)} were found, {sorted(true)} are there"]
+    print("| part | index | truth | tint | truth | top | truth |\n|---|---|---|---|---|---|---|")
+    wrong = []
+    for kind, part in ours.items():
+        tops = [float(each.vertices[:, 2].max()) for each in (part, true[kind])]
+        tints = [np.asarray(each.tint) for each in (part, true[kind])]
+        print(
+            f"| {kind} | {part.index:.4f} | {true[kind].index:g} | {np.round(tints[0], 3)} | "
+            f"{tints[1]} | {tops[0]:.4f} | {tops[1]:.4f} |",
+            flush=True,
+        )
+        within = {
+            "index": abs(part.index - true[kind].index) <= _LIQUID,
+            "tint": np.max(np.abs(tints[0] - tints[1])) <= _TINT,
+            "level": kind != "liquid" or abs(tops[0] - tops[1]) <= _LEVEL,
+        }
+        wrong += [f"{name}: {what} of {kind}" for what, holds in within.items() if not holds]
+    return wrong
+
+
+def _kind(part: meshes.MeshPart) -> str:
+    """Returns what a part is of: glass, air, or some liquid."""
+    word = part.name.split("_")[-1]
+    return word if word in ("glass", "air") else "liquid"
 
 
 def _rows(out: Path, found: Reconstruction, parts: Sequence[meshes.MeshPart]) -> tuple[Row, ...]:
