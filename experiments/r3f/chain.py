@@ -189,6 +189,8 @@ def _refined(scene: Path, out: Path, found: Reconstruction, say: Say) -> Reconst
         say(_describe_light(found.light))
     refined = found.light is not None and found.light.kept
     if found.index.source == "estimated" and found.index.error is None and not refined:
+        # Without it, --ior may be given when the command is repeated.
+        records.write(out, dataclasses.replace(found, index=None, light=None, report=None))
         _refuse_index(out, found.index.index)
     return found
 

@@ -3,12 +3,12 @@
     {out}/light/{object}_{material}.ply    the refined surface, if it was kept
     {out}/light/errors.png                 pixels before and after, and the uncertainty of normals
 
-If the object is a body of revolution, and solid glass explains its pixels badly, the stage first
-looks at what may be inside (`reconstruct.interior_search`); a vessel becomes several parts. Else
-families of shapes and a free surface are fitted to pixels of the training views, together with the
-index (`reconstruct.shape_from_refraction`). Pixels that were not fitted judge: those of the
-validation views, or of every eighth training view where these have no masks. Where the background
-is a field, and where light explains nothing better, the surface stays as it is.
+Families of shapes and a free surface are fitted to pixels of the training views, together with the
+index (`reconstruct.shape_from_refraction`). If the object is a body of revolution, and no solid
+glass explains its pixels, the stage looks at what may be inside instead of a free surface
+(`reconstruct.interior_search`); a vessel becomes several parts. Pixels that were not fitted judge:
+those of the validation views, or of every eighth training view where these have no masks. Where the
+background is a field, and where light explains nothing better, the surface stays as it is.
 """
 
 import itertools
@@ -32,6 +32,7 @@ from refref_jax.geometry.cameras import image_rays
 from refref_jax.geometry.surfaces import pack_meshes
 from refref_jax.geometry.triangle_meshes import Mesh
 from refref_jax.reconstruct import (
+    ReconstructionError,
     families,
     gauss_newton,
     interior_looks,
@@ -40,16 +41,16 @@ from refref_jax.reconstruct import (
     photometry,
     shape_from_refraction,
 )
+from refref_jax.reconstruct.families import Revolution
 from refref_jax.reconstruct.gauss_newton import Fit
 from refref_jax.reconstruct.interior_looks import SearchSettings
+from refref_jax.reconstruct.interior_search import Finding
 from refref_jax.reconstruct.interiors import Solid, Vessel
 from refref_jax.reconstruct.masks import Views
 from refref_jax.reconstruct.model_selection import Trial, judged
 from refref_jax.reconstruct.outlines import Outlines
 from refref_jax.reconstruct.photometry import Backdrop, Photographs
 from refref_jax.reconstruct.refinement import objection
-from refref_jax.reconstruct.shape_from_refraction import SingleObject
-from refref_jax.reconstruct.shapes import FixedShape
 from refref_jax.render.images import find_first_surface
 
 FOLDER = "light"
@@ -58,6 +59,9 @@ FIGURE = "errors.png"
 
 # Number of pixels that judge, and one training view in this many, if there are no others.
 _JUDGES, _ONE_IN = 16_384, 8
+
+# Most pixels that steps draw from.
+_FITTED = 2_000_000
 
 # Error of pixels through solid glass above which something may be inside, sRGB, and largest rms
 # distance of the surface from a body of revolution, as a share of its diameter.
@@ -110,27 +114,26 @@ def run(
         return LightFacts(kept=False, index=known.index, remark=reason)
     seen = read(scene, seed=seed)
     trials = fit(scene, mesh, known, surface, seen, seed=seed)
-    masks, chosen = trials[0], model_selection.choose(trials)
-    remark = "" if chosen is not masks else "no shape explains the judges significantly better"
-    if not remark and (complaint := objection(mesh, chosen.mesh, _VOLUME_CHANGE)):
-        chosen, remark = masks, f"the {chosen.name} was rejected: {complaint}"
+    masks, chosen, remark = _choose(mesh, trials)
     kept = chosen is not masks
-    deviations = model_selection.normal_deviations(chosen)
+    deviations = model_selection.normal_deviations(chosen) if kept else None
     parts: tuple[PartFacts, ...] = ()
     with atomic_files.written_folder(target.parent) as folder:
         if kept and isinstance(chosen.model, Vessel):
-            parts = _write_parts(folder, target.stem, chosen.model.solids(chosen.fit.x))
+            solids = chosen.model.solids(chosen.fit.x)
+            parts = _write_parts(folder, target.stem, solids, known)
         elif kept:
             meshes.write_mesh(folder / target.name, *chosen.mesh)
         draw(folder / FIGURE, scene, seen.split, masks, chosen, surface, deviations)
-    unknown = float(np.mean(deviations > _UNKNOWN)) if kept else 1.0
+    unknown = 1.0 if deviations is None else float(np.mean(deviations > _UNKNOWN))
+    estimated = known.source == "estimated"
     return LightFacts(
         kept=kept,
-        index=chosen.outer_index if known.source == "estimated" else known.index,
+        index=chosen.outer_index if estimated else known.index,
         shape=chosen.name,
         before=masks.error,
         after=chosen.error,
-        deviation=chosen.index_deviation if kept else None,
+        deviation=chosen.index_deviation if kept and estimated else None,
         undetermined=unknown,
         split=seen.split,
         remark=remark,
@@ -139,14 +142,40 @@ def run(
     )
 
 
-def _write_parts(folder: Path, stem: str, solids: Sequence[Solid]) -> tuple[PartFacts, ...]:
+def _choose(mesh: Mesh, trials: Sequence[Trial]) -> tuple[Trial, Trial, str]:
+    """Returns the mesh from masks, the chosen trial, and the reason if both are the same.
+
+    Trials that change the volume are left out; that of a vessel is of its glass alone, so that only
+    its outer wall, which comes from masks, says that it is the same object.
+    """
+    masks, *others = trials
+    complaints = {
+        trial.name: objection(mesh, trial.mesh, _VOLUME_CHANGE)
+        for trial in others
+        if not isinstance(trial.model, Vessel)
+    }
+    chosen = model_selection.choose(
+        [masks, *(trial for trial in others if not complaints.get(trial.name))]
+    )
+    if chosen is not masks:
+        return masks, chosen, ""
+    best = min(trials, key=lambda trial: trial.error)
+    if complaint := complaints.get(best.name):
+        return masks, masks, f"the {best.name} was rejected: {complaint}"
+    return masks, masks, "no shape explains the judges significantly better"
+
+
+def _write_parts(
+    folder: Path, stem: str, solids: Sequence[Solid], known: IndexFacts
+) -> tuple[PartFacts, ...]:
     """Writes the parts of a vessel; their files are named after materials of nearly their index."""
     facts, name = [], stem.rsplit("_", 1)[0]
     for solid in solids:
         material = min(_MATERIALS, key=lambda each: abs(each[1] - solid.index))[0]
         file = f"{name}_{solid.name}_{material}.ply"
         meshes.write_mesh(folder / file, *solid.mesh)
-        facts.append(PartFacts(file, solid.index, solid.tint))
+        given = known.source == "given" and solid.name == "glass"
+        facts.append(PartFacts(file, known.index if given else solid.index, solid.tint))
     return tuple(facts)
 
 
@@ -156,12 +185,12 @@ def read(scene: Path, *, seed: int) -> Seen:
     Raises:
       ValueError: if no pixel is well inside a mask.
     """
-    fitted = index_stage.photographs(scene, "train", seed=seed)
+    fitted = index_stage.photographs(scene, "train", seed=seed, rays=_FITTED)
     path = scene / "transforms_val.json"
     if path.is_file() and scene_folder.read_frames(scene, "val").masks is not None:
         judges = index_stage.photographs(scene, "val", seed=seed + 1, rays=_JUDGES)
         return Seen(fitted, judges, "val")
-    held = fitted.views % _ONE_IN == 0
+    held = np.isin(fitted.views, np.unique(fitted.views)[::_ONE_IN])
     some = np.flatnonzero(held)
     some = np.random.default_rng(seed).permutation(some)[:_JUDGES]
     return Seen(fitted.chosen(np.flatnonzero(~held)), fitted.chosen(some), "train")
@@ -182,14 +211,10 @@ def fit(
     """
     frames = scene_folder.read_frames(scene, "train")
     outlines = Outlines(Views(scene_folder.read_masks(frames), frames.cameras), seed=seed)
-    solid = SingleObject(FixedShape(mesh), known.index)
-    masks = judged("masks", solid, Fit(solid.start(), np.zeros((1, 1)), ()), surface, seen.judges)
-    vessels = _vessels(masks, mesh, surface, seen, outlines, seed=seed)
-    if vessels and model_selection.choose([masks, *vessels]) is not masks:
-        return (masks, *vessels)
+    outer = families.fit_revolution(mesh, furthest=_FURTHEST)
     options = {} if known.source == "estimated" else {"deviation": 0.0}
     with ProgressBar("light", 100) as bar:
-        return shape_from_refraction.fit_shapes(
+        trials = shape_from_refraction.fit_shapes(
             mesh,
             known.index,
             surface,
@@ -197,28 +222,62 @@ def fit(
             seen.judges,
             outlines=outlines,
             seed=seed,
+            is_enough=lambda trials: _may_be_vessel(outer, trials),
             progress=lambda share, text: bar.show(round(100 * share), text),
             **options,
         )
+    if not _may_be_vessel(outer, trials):
+        return trials
+    return (*trials, *_vessels(outer, known, surface, seen, outlines, seed=seed))
+
+
+def _may_be_vessel(outer: Revolution | None, trials: Sequence[Trial]) -> bool:
+    """Returns whether no solid shape explains the pixels of an object that may be a vessel."""
+    if outer is None or outer.closed:
+        return False
+    return min(trial.error for trial in trials) > _UNEXPLAINED
 
 
 def _vessels(
-    masks: Trial,
-    mesh: Mesh,
+    outer: Revolution,
+    known: IndexFacts,
     surface: Backdrop,
     seen: Seen,
     outlines: Outlines,
     *,
     seed: int,
 ) -> list[Trial]:
-    """Returns vessels that were fitted; none if solid glass may explain the pixels.
-
-    The looks at hypotheses decide: if solid glass is the best of them, there is no vessel.
-    """
-    outer = families.fit_revolution(mesh, furthest=_FURTHEST)
-    if masks.error < _UNEXPLAINED or outer is None or outer.closed:
+    """Returns vessels that were fitted; none if solid glass is the best look, or no wall fits."""
+    glass = {"glass": known.index} if known.source == "given" else {}
+    settings = SearchSettings(seed=seed, **glass)
+    try:
+        found = _search(outer, surface, seen, outlines, settings)
+    except ReconstructionError:
         return []
-    settings = SearchSettings(seed=seed)
+    return [
+        judged(
+            f"vessel: {each.name}",
+            each.vessel,
+            Fit(each.x, each.covariance, ()),
+            surface,
+            seen.judges,
+        )
+        for each in found
+    ]
+
+
+def _search(
+    outer: Revolution,
+    surface: Backdrop,
+    seen: Seen,
+    outlines: Outlines,
+    settings: SearchSettings,
+) -> list[Finding]:
+    """Looks at what may be inside, and fits the best hypotheses.
+
+    Raises:
+      ReconstructionError: if no wall fits into the object.
+    """
     with ProgressBar("inside", 100) as bar:
         bar.show(0, "looking at hypotheses")
         looks = interior_looks.looks_at_all(outer, surface, seen.fitted, settings)
@@ -237,17 +296,7 @@ def _vessels(
             progress=lambda line: bar.show(min(next(count), 99), line),
         )
         bar.show(100, f"vessel: {found.best.name}")
-    others = [each for each in found.findings if each.name != found.best.name]
-    return [
-        judged(
-            f"vessel: {each.name}",
-            each.vessel,
-            Fit(each.x, each.covariance, ()),
-            surface,
-            seen.judges,
-        )
-        for each in (found.best, *others)
-    ]
+    return [found.best, *(each for each in found.findings if each.name != found.best.name)]
 
 
 def _facts(trial: Trial, best: Trial) -> TrialFacts:
@@ -271,7 +320,7 @@ def draw(
     before: Trial,
     after: Trial,
     surface: Backdrop,
-    deviations: Float[np.ndarray, " normals"],
+    deviations: Float[np.ndarray, " normals"] | None,
 ) -> None:
     """Draws views: the photograph, what both surfaces predict, their errors, and the uncertainty.
 
@@ -282,7 +331,8 @@ def draw(
       before: the surface from masks.
       after: the chosen one.
       surface: backdrop.
-      deviations: standard deviation of each normal of the chosen surface, degrees.
+      deviations: standard deviation of each normal of the chosen surface, degrees; `None` if light
+        has not determined them.
     """
     frames = scene_folder.read_frames(scene, split)
     count = len(frames.names)
@@ -343,14 +393,14 @@ _SHAPES = {"origins": (3,), "directions": (3,), "radii": ()}
 
 
 def _seen_deviations(
-    frames: Frames, view: int, trial: Trial, deviations: Float[np.ndarray, " normals"]
+    frames: Frames, view: int, trial: Trial, deviations: Float[np.ndarray, " normals"] | None
 ) -> Float[np.ndarray, "h w"]:
     """Returns the deviation of the normal that each pixel sees, NaN beside the object."""
     rays = image_rays(frames.cameras, view)
     first = find_first_surface(pack_meshes([trial.mesh]), rays)
     seen = np.full(first.distances.shape, np.nan)
     hit = np.isfinite(first.distances)
-    if not len(deviations) or not hit.any():
+    if deviations is None or not hit.any():
         return seen
     part = trial.model.pose(trial.fit.x).parts[0]
     of_vertices = np.zeros(len(part.vertices))

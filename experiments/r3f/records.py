@@ -153,15 +153,17 @@ class LightFacts:
       kept: whether the refined surface is used.
       index: index of refraction of the surface that is used.
       shape: kind of the chosen shape.
-      before: mean error of the judges with the surface from masks, sRGB; `None` if none was looked
-        at.
+      before: mean error of the judges with the surface from masks, sRGB; `None` if no shape was
+        fitted.
       after: the same with the chosen one.
       deviation: standard deviation of the index; `None` if it was not refined.
       undetermined: share of the normals that light has not determined.
       split: split of the views that judge.
-      remark: reason why the surface was not refined.
+      remark: reason why the surface from masks was kept.
       trials: all shapes that were fitted.
       parts: parts of the object, the outermost first, if light found several.
+      steps: number of steps, of a refinement by an earlier version.
+      furthest: largest displacement of the surface, world units, of the same.
     """
 
     kept: bool
@@ -175,6 +177,8 @@ class LightFacts:
     remark: str = ""
     trials: tuple[TrialFacts, ...] = ()
     parts: tuple[PartFacts, ...] = ()
+    steps: int | None = None
+    furthest: float | None = None
 
 
 @dataclasses.dataclass(frozen=True)

@@ -22,7 +22,7 @@ from refref_jax.data.scene_folder import Frames
 from refref_jax.geometry.cameras import Cameras, image_rays
 from refref_jax.geometry.rays import Rays
 from refref_jax.geometry.surfaces import pack_meshes
-from refref_jax.geometry.triangle_meshes import Mesh, diameter, join
+from refref_jax.geometry.triangle_meshes import Mesh, diameter, join, volume
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.reconstruct.masks import overlaps
 from refref_jax.reconstruct.mesh_distance import compare_meshes, signed_distance, silhouettes
@@ -41,7 +41,7 @@ _SPLITS = ("test", "val", "train")
 
 _SEEN_ON = {
     "test": "test views, which were not used in the reconstruction",
-    "val": "validation views, which were not used in the reconstruction",
+    "val": "validation views, which were not fitted, but chose the shape",
     "train": "training views, which were used in the reconstruction",
 }
 
@@ -230,18 +230,24 @@ def _of_index(index: IndexFacts) -> str:
 
 
 def _table(out: Path, found: Reconstruction, facts: ReportFacts) -> str:
-    geometry, index = found.geometry, object_source.index_facts(found)
+    index, mesh = object_source.index_facts(found), object_source.read_mesh(out, found)
     error = "" if index.error is None else f" ± {index.error:.4f} (one standard deviation)"
     surface = object_source.surface_file(out, found).relative_to(out)
     rows = [
-        ("surface", f"[{geometry.mesh}]({surface}), {geometry.faces:,} triangles"),
-        ("diameter, volume", f"{geometry.diameter:.3f}, {geometry.volume:.3f} (world units)"),
+        ("surface", f"[{surface.name}]({surface}), {len(mesh.faces):,} triangles"),
+        (
+            "diameter, volume",
+            f"{diameter(mesh.vertices):.3f}, {volume(mesh.vertices, mesh.faces):.3f} (world units)",
+        ),
         ("index of refraction", f"**{index.index:.4f}**{error}, {index.source}"),
         (
             "silhouettes: mean IoU, least",
             f"**{facts.mean_overlap:.4f}**, {min(facts.overlaps):.4f}",
         ),
     ]
+    for part in found.light.parts[1:] if found.light is not None else ():
+        tint = "" if part.tint is None else f", tint {' '.join(f'{x:.3f}' for x in part.tint)}"
+        rows.append((f"inside: [{part.mesh}](light/{part.mesh})", f"index {part.index:.4f}{tint}"))
     if found.light is not None and found.light.before is not None:
         light = found.light
         after = f"{light.after:.4f} as a {light.shape}" if light.kept else "not refined"
@@ -263,9 +269,9 @@ def _table(out: Path, found: Reconstruction, facts: ReportFacts) -> str:
 
 def _of_truth(facts: ReportFacts) -> str:
     shown = (
-        "Masks do not show cavities, dents that no line of sight grazes, or the inside of glass: "
-        "the object is filled, with one index. Normals are in the camera's frame: right is red, up "
-        "is green, towards the camera is blue."
+        "Masks do not show cavities, dents that no line of sight grazes, or the inside of glass; "
+        "only light does. Normals are in the camera's frame: right is red, up is green, towards "
+        "the camera is blue."
     )
     if facts.truth is None:
         return f"{facts.remark} {shown}"

@@ -30,6 +30,9 @@ FLAGS = (METHOD, *_RECONSTRUCTED)
 
 Options = Mapping[str, flags.FlagHolder]
 
+# File of a run that has begun.
+_CONFIG = "config.json"
+
 FOLDER = "r3f"
 """Folder of the reconstruction, relative to the run's folder."""
 
@@ -166,6 +169,8 @@ def find(
         raise ValueError(
             f"{out} already contains a reconstruction. Continue with --resume, or change --out."
         )
+    if records.exists(out) and (run / _CONFIG).is_file():
+        return chain.read_parts(out)  # the run has begun with it
     overrides = config.overrides()  # a reconstruction makes its own decisions
     space, radius, centre = chain.bounds_of(
         scene,

@@ -175,11 +175,13 @@ class Equations(NamedTuple):
       matrix: `J^T W J / s^2`.
       gradient: `J^T W r / s^2`.
       by_view: the share of each view in the gradient of the pixels.
+      of_pixels: the part of the matrix that comes from pixels.
     """
 
     matrix: Float[np.ndarray, "unknowns unknowns"]
     gradient: Float[np.ndarray, " unknowns"]
     by_view: Float[np.ndarray, "views unknowns"]
+    of_pixels: Float[np.ndarray, "unknowns unknowns"]
 
 
 def traced_object(candidate: Candidate) -> TracedObject:
@@ -356,17 +358,14 @@ def linearise(
     matrix = jacobian.T @ weighted
     dense = matrix.toarray() if scipy.sparse.issparse(matrix) else matrix
     scale = max(squared, _LEAST_NOISE**2)
-    by_ray = np.arange(3 * len(error)) // 3
+    names, views = np.unique(pixels.views, return_inverse=True)
     each = scipy.sparse.csr_array(
-        (
-            error.reshape(-1) / scale,
-            (pixels.views[by_ray], 3 * by_ray + np.arange(by_ray.size) % 3),
-        ),
-        shape=(int(pixels.views.max()) + 1, by_ray.size),
+        (error.reshape(-1) / scale, (np.repeat(views, 3), np.arange(error.size))),
+        shape=(len(names), error.size),
     )
     by_view = each @ weighted
     by_view = by_view.toarray() if scipy.sparse.issparse(by_view) else by_view
-    return Equations(dense / scale, by_view.sum(axis=0), by_view)
+    return Equations(dense / scale, by_view.sum(axis=0), by_view, dense / scale)
 
 
 def _covariance(
@@ -376,7 +375,7 @@ def _covariance(
     inverse = np.linalg.inv(light.matrix + precision)
     views = light.by_view - light.by_view.mean(axis=0)
     scatter = np.sum((views @ inverse) ** 2, axis=0)
-    independent = np.einsum("ij,jk,ki->i", inverse, light.matrix, inverse)
+    independent = np.einsum("ij,jk,ki->i", inverse, light.of_pixels, inverse)
     alike = float(np.median(scatter / np.maximum(independent, 1e-300)))
     return inverse * max(1.0, alike)
 

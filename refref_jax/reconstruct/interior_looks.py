@@ -38,6 +38,7 @@ class SearchSettings:
       levels: number of heights of the liquid's surface.
       gaps: heights of the glass between liquid and air, as shares of the diameter.
       indices: indices of refraction of the liquid.
+      glass: index of refraction of the glass.
       mouths: whether vessels may be closed, open, or both.
       stained: whether the glass may have a tint.
       blur: halvings of the backdrop's resolution in looks.
@@ -58,6 +59,7 @@ class SearchSettings:
     levels: int = 10
     gaps: tuple[float, ...] = (0.004, 0.04)
     indices: tuple[float, ...] = (1.36, 1.333, 1.47)
+    glass: float = 1.5
     mouths: tuple[bool, ...] = (False, True)
     stained: bool = False
     blur: int = 3
@@ -86,7 +88,7 @@ class Look(NamedTuple):
 
 
 def hypotheses(outer: Revolution, settings: SearchSettings = SearchSettings()) -> list[Interior]:
-    """Returns what may be inside a outer, the simplest first.
+    """Returns what may be inside an outer surface, the simplest first.
 
     Indices other than the first, and open vessels, are tried later, for the best of these.
     """
@@ -99,6 +101,7 @@ def hypotheses(outer: Revolution, settings: SearchSettings = SearchSettings()) -
                 contents,
                 wall=wall * size,
                 gap=settings.gaps[-1] * size,
+                glass=settings.glass,
                 liquid=settings.indices[0],
                 stained=settings.stained,
             )

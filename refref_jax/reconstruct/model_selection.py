@@ -19,6 +19,9 @@ from refref_jax.reconstruct.gauss_newton import Candidate, Fit, Model
 from refref_jax.reconstruct.photometry import Backdrop, Photographs
 from refref_jax.reconstruct.shapes import mesh_of
 
+# Number of normals whose deviations are found at once.
+_NORMALS = 4096
+
 # Standard errors by which a trial must be worse than the best to lose.
 _WORSE = 2.0
 
@@ -129,7 +132,10 @@ def choose(trials: Sequence[Trial]) -> Trial:
 def normal_deviations(trial: Trial) -> Float[np.ndarray, " normals"]:
     """Returns the standard deviation of each normal of the outermost part, in degrees."""
     by: Any = trial.candidate.parts[0].by_normals
-    spread = by @ trial.fit.covariance
-    both = by.multiply(spread) if scipy.sparse.issparse(by) else np.asarray(by) * spread
-    variance = np.asarray(both.sum(axis=1)).reshape(-1, 3).sum(axis=1)
-    return np.degrees(np.sqrt(np.maximum(variance, 0.0)))
+    found = []
+    for start in range(0, by.shape[0], 3 * _NORMALS):
+        some = by[start : start + 3 * _NORMALS]
+        spread = some @ trial.fit.covariance
+        both = some.multiply(spread) if scipy.sparse.issparse(some) else np.asarray(some) * spread
+        found.append(np.asarray(both.sum(axis=1)).reshape(-1, 3).sum(axis=1))
+    return np.degrees(np.sqrt(np.maximum(np.concatenate(found), 0.0)))

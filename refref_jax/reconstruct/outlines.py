@@ -55,7 +55,10 @@ class Outlines:
           seed: seed of the draws of rim points.
         """
         self._cameras, self._seed = views.cameras, seed
-        self._distances = [signed_distances(mask) for mask in views.masks]
+        self._distances = [
+            signed_distances(mask).astype(np.float32) if mask.any() and not mask.all() else None
+            for mask in views.masks
+        ]
 
     def __call__(self, candidate: Candidate) -> Rows:
         """Returns the equations of the outline of the first part, which contains all others."""
@@ -64,8 +67,9 @@ class Outlines:
         edges = _edges(part.faces)
         generator = np.random.default_rng(self._seed)
         found = [
-            self._of_view(view, part, normals, edges, generator)
-            for view in range(len(self._cameras.poses))
+            self._of_view(view, distances, part, normals, edges, generator)
+            for view, distances in enumerate(self._distances)
+            if distances is not None
         ]
         errors = np.concatenate([each[0] for each in found])
         derivatives = scipy.sparse.vstack([each[1] for each in found]).tocsr()
@@ -75,6 +79,7 @@ class Outlines:
     def _of_view(
         self,
         view: int,
+        distances: Float[np.ndarray, "h w"],
         part: Posed,
         normals: Float[np.ndarray, "vertices 3"],
         edges: Int[np.ndarray, "edges 2"],
@@ -86,8 +91,10 @@ class Outlines:
         share = rim.share[:, None]
         points = (1.0 - share) * part.vertices[rim.first] + share * part.vertices[rim.second]
         seen = project(points, pose, self._cameras)
-        distance, slope = _sample(self._distances[view], seen.pixels)
-        near = np.flatnonzero((np.abs(distance) < _FURTHEST) & (seen.depths > 0.0))
+        distance, slope = _sample(distances, seen.pixels)
+        size = np.array([self._cameras.width, self._cameras.height])
+        visible = (seen.depths > 0.0) & np.all((seen.pixels > 0) & (seen.pixels < size), axis=-1)
+        near = np.flatnonzero((np.abs(distance) < _FURTHEST) & visible)
         near = generator.permutation(near)[:_POINTS]
         rows = _by_points(slope[near], seen.pixels[near], seen.depths[near], pose, self._cameras)
         first, second = rim.first[near], rim.second[near]

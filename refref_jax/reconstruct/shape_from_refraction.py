@@ -1,14 +1,14 @@
 """Shape and index of refraction of one clear object, from photographs of light refracted by it.
 
 `find_index` looks for the index of an object of known shape. `SingleObject` has the unknowns of a
-shape and the index; `fit_best` fits shapes of several families and chooses the smallest one that
-explains held-out pixels not significantly worse than the best.
+shape and the index; `fit_shapes` fits shapes of several families, of which `model_selection.choose`
+keeps the smallest that held-out pixels do not find significantly worse than the best.
 
 Source: ours; the paper (arXiv 2505.05848) smooths by hand, and trains the index with the field.
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -158,8 +158,8 @@ def find_index(
 ) -> IndexEstimate:
     """Estimates the index of refraction of an object of known shape.
 
-    The error of few pixels is looked at on a ladder of indices, before a blurred backdrop, whose
-    valleys are wide. Gauss-Newton steps with ever less blur begin at the best rungs.
+    The error of few pixels is looked at on a ladder of indices, in front of a blurred backdrop,
+    where valleys are wide. Gauss-Newton steps with ever less blur begin at the best rungs.
 
     Args:
       mesh: mesh of the object.
@@ -262,6 +262,7 @@ def fit_shapes(
     deviation: float = _INDEX_DEVIATION,
     outlines: Outlines | None = None,
     seed: int = 0,
+    is_enough: Callable[[Sequence[Trial]], bool] = lambda trials: False,
     progress: Callable[[float, str], None] = lambda share, text: None,
 ) -> tuple[Trial, ...]:
     """Fits the families that come near a mesh to photographs, the fewest unknowns first.
@@ -278,6 +279,7 @@ def fit_shapes(
       deviation: standard deviation of the index; 0 keeps it.
       outlines: equations of the masks' outlines.
       seed: seed of the draws.
+      is_enough: called with the trials before the free surface, which is left out if it is true.
       progress: called with the share of the work that is done, and a line of text.
     """
     task = _Task(surface, pixels, judges, outlines, deviation, seed)
@@ -299,6 +301,8 @@ def fit_shapes(
         )
         trials.append(task.judged(shape.name, model, fit))
         done += count + 2
+    if is_enough(trials):
+        return tuple(trials)
     best = min(trials, key=lambda trial: trial.error)
     trials.append(
         _fit_free(
