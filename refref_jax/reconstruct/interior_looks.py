@@ -87,7 +87,7 @@ class Look(NamedTuple):
     error: float
 
 
-def hypotheses(outer: Revolution, settings: SearchSettings = SearchSettings()) -> list[Interior]:
+def hypotheses(outer: Revolution, *, settings: SearchSettings = SearchSettings()) -> list[Interior]:
     """Returns what may be inside an outer surface, the simplest first.
 
     Indices other than the first, and open vessels, are tried later, for the best of these.
@@ -126,6 +126,7 @@ def look(
     interior: Interior,
     surface: Backdrop,
     pixels: Photographs,
+    *,
     detail: Detail = COARSE,
 ) -> Look:
     """Predicts some pixels for a hypothesis, with the tint that suits it best.
@@ -199,7 +200,7 @@ def looks_at_all(
                 continue
         return found
 
-    looks = tried(hypotheses(outer, settings))
+    looks = tried(hypotheses(outer, settings=settings))
     if not looks:
         raise ReconstructionError(
             "No wall leaves space inside the object. Pass smaller `thicknesses`."

@@ -139,7 +139,7 @@ def test_what_can_not_be_a_vessel_is_refused(body):
 
 
 def test_hypotheses_begin_with_the_simplest(body):
-    found = hypotheses(body, SearchSettings(levels=3, thicknesses=(0.05, 0.1)))
+    found = hypotheses(body, settings=SearchSettings(levels=3, thicknesses=(0.05, 0.1)))
     names = list(dict.fromkeys(each.name for each in found))
     assert names == ["none", "air", "liquid", "liquid and air"]
     assert [sum(each.name == name for each in found) for name in names] == [1, 2, 2, 6]
@@ -188,7 +188,7 @@ def photographs(body, surface, small_tiles):
 def test_a_look_finds_the_tint_and_prefers_the_truth(body, surface, photographs):
     clear = dataclasses.replace(_FLASK, tint=(1.0, 1.0, 1.0))
     others = (dataclasses.replace(clear, level=0.3), Interior("liquid", wall=0.12))
-    best, *worse = (look(body, at, surface, photographs, _SMALL) for at in (clear, *others))
+    best, *worse = (look(body, at, surface, photographs, detail=_SMALL) for at in (clear, *others))
     assert best.interior.tint == pytest.approx(_FLASK.tint, abs=0.03)
     assert best.error < 0.01
     assert all(each.error > 2.0 * best.error for each in worse)
@@ -199,10 +199,10 @@ def test_level_index_and_tint_are_recovered(body, surface, photographs):
     vessel = Vessel(body, start, _SMALL)
     layout = vessel.layout
     few = Few(vessel, vessel.start(), np.eye(layout.count)[:, layout.inner.stop :])
-    steps = gauss_newton.Steps((2, 1, 1, 0, 0, 0, 0, 0), 4096, 4096)
+    steps = gauss_newton.Steps((2, 1, 1, *[0] * 9), 4096, 4096)
     fit = gauss_newton.fit(few, few.start(), surface, photographs, settings=steps)
     found = vessel.interior(few.whole(fit.x))
-    assert found.level == pytest.approx(_FLASK.level, abs=0.005)
+    assert found.level == pytest.approx(_FLASK.level, abs=0.01)
     assert found.gap == pytest.approx(_FLASK.gap, abs=0.01)
     assert found.liquid == pytest.approx(1.36, abs=0.003)
     assert found.glass == pytest.approx(1.5, abs=0.003)
