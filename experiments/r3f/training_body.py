@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -169,8 +170,6 @@ def find(
         raise ValueError(
             f"{out} already contains a reconstruction. Continue with --resume, or change --out."
         )
-    if records.exists(out) and (run / _CONFIG).is_file():
-        return chain.read_parts(out)  # the run has begun with it
     overrides = config.overrides()  # a reconstruction makes its own decisions
     space, radius, centre = chain.bounds_of(
         scene,
@@ -182,6 +181,9 @@ def find(
     asked = _RECONSTRUCTED.chosen(
         index=index, seed=config.seed, space=space, radius=radius, centre=centre
     )
+    if records.exists(out) and (run / _CONFIG).is_file() and not _RECONSTRUCTED.refinement.present:
+        # The run has begun with its object, maybe before light refined objects by default.
+        asked = dataclasses.replace(asked, refinement=records.read(out).config.refinement)
     try:
         chain.reconstruct(scene, out, asked, compare=False)
     except KeyboardInterrupt:
