@@ -42,12 +42,11 @@ from refref_jax.reconstruct import (
     shape_from_refraction,
 )
 from refref_jax.reconstruct.families import Revolution
-from refref_jax.reconstruct.gauss_newton import Fit
 from refref_jax.reconstruct.interior_looks import SearchSettings
 from refref_jax.reconstruct.interior_search import Finding
 from refref_jax.reconstruct.interiors import Solid, Vessel
 from refref_jax.reconstruct.masks import Views
-from refref_jax.reconstruct.model_selection import Trial, judged
+from refref_jax.reconstruct.model_selection import Trial
 from refref_jax.reconstruct.outlines import Outlines
 from refref_jax.reconstruct.photometry import Backdrop, Photographs
 from refref_jax.reconstruct.refinement import objection
@@ -254,16 +253,7 @@ def _vessels(
         found = _search(outer, surface, seen, outlines, settings)
     except ReconstructionError:
         return []
-    return [
-        judged(
-            f"vessel: {each.name}",
-            each.vessel,
-            Fit(each.x, each.covariance, ()),
-            surface,
-            seen.judges,
-        )
-        for each in found
-    ]
+    return [each.trial for each in found]
 
 
 def _search(

@@ -237,7 +237,7 @@ def fit(
     if not len(pixels.views):
         raise ReconstructionError("No pixel sees the object. Check the masks and the cameras.")
     generator = np.random.default_rng(settings.seed)
-    draw = functools.partial(_draw, pixels, generator)
+    draw = functools.partial(pixels.drawn, generator)
     damping, facts = 1e-3, []
     for number, blur in enumerate(settings.blurs):
         seen = photometry.blurred(surface, blur)
@@ -256,12 +256,6 @@ def fit(
             break
     precision, _ = model.prior(x)
     return Fit(x, _covariance(light, precision), tuple(facts))
-
-
-def _draw(pixels: Photographs, generator: np.random.Generator, count: int) -> Photographs:
-    """Draws pixels without repetition."""
-    every = len(pixels.views)
-    return pixels.chosen(generator.choice(every, min(count, every), replace=False))
 
 
 def _step(

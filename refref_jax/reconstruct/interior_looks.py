@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from refref_jax.reconstruct import ReconstructionError, gauss_newton, photometry
 from refref_jax.reconstruct.contents import COARSE, Contents, Detail, Interior
@@ -188,7 +188,7 @@ def looks_at_all(
     if not len(pixels.views):
         raise ReconstructionError("No pixel sees the object. Check the masks and the cameras.")
     generator = np.random.default_rng(settings.seed)
-    some = pixels.chosen(draw(generator, len(pixels.views), settings.pixels))
+    some = pixels.drawn(generator, settings.pixels)
     blurred = photometry.blurred(surface, settings.blur)
 
     def tried(interiors: Iterator[Interior] | Sequence[Interior]) -> list[Look]:
@@ -215,11 +215,6 @@ def finalists(looks: Sequence[Look], settings: SearchSettings) -> list[Look]:
     """Returns the best looks of each kind, without those that are far worse than the best."""
     best = min(each.error for each in looks)
     return [each for each in _best_looks(looks, settings) if each.error < settings.rivals * best]
-
-
-def draw(generator: np.random.Generator, every: int, count: int) -> Int[np.ndarray, " count"]:
-    """Draws some of all pixels without repetition."""
-    return generator.choice(every, min(count, every), replace=False)
 
 
 def _other_gaps(at: Interior, outer: Revolution, settings: SearchSettings) -> list[Interior]:

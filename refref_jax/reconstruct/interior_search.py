@@ -23,21 +23,18 @@ from jaxtyping import Float
 from refref_jax.reconstruct import gauss_newton, photometry
 from refref_jax.reconstruct.contents import COARSE, FINE, Detail, Interior
 from refref_jax.reconstruct.families import Revolution
-from refref_jax.reconstruct.gauss_newton import Candidate, Matrix, Model, Rows, Steps
+from refref_jax.reconstruct.gauss_newton import Candidate, Fit, Matrix, Model, Rows, Steps
 from refref_jax.reconstruct.interior_looks import (
     Look,
     SearchSettings,
-    draw,
     extent,
     finalists,
     look,
     looks_at_all,
 )
 from refref_jax.reconstruct.interiors import Vessel
+from refref_jax.reconstruct.model_selection import Trial, choose, judged
 from refref_jax.reconstruct.photometry import Backdrop, Photographs
-
-# Errors above this multiple of what the backdrop leaves unexplained are those of a wrong interior.
-_UNEXPLAINED = 2.5
 
 # Share of the pixels of largest derivatives that a step leaves out: interiors have many surfaces.
 _OUTLIERS = 0.02
@@ -45,29 +42,32 @@ _OUTLIERS = 0.02
 # Gaps tried once the level is known, as shares of the diameter, and the blur of these looks.
 _GAPS, _GAP_BLUR = (0.001, 0.004, 0.01, 0.02, 0.03, 0.045, 0.06, 0.08, 0.1), 2
 
-# Standard errors by which a hypothesis must be worse than the best to lose.
-_WORSE = 2.0
-
 
 class Finding(NamedTuple):
     """A hypothesis after it was fitted.
 
     Attributes:
-      vessel: its model.
-      x: its unknowns.
-      covariance: their covariance.
-      error: mean robust error of the held-out pixels in sRGB.
+      vessel: model of the hypothesis.
+      trial: result of its fit.
     """
 
     vessel: Vessel
-    x: Float[np.ndarray, " unknowns"]
-    covariance: Float[np.ndarray, "n n"]
-    error: float
+    trial: Trial
 
     @property
     def name(self) -> str:
         """What is inside, in words."""
         return self.vessel.interior_at_start.name
+
+    @property
+    def x(self) -> Float[np.ndarray, " unknowns"]:
+        """Unknowns of the vessel."""
+        return self.trial.fit.x
+
+    @property
+    def error(self) -> float:
+        """Mean robust error of the held-out pixels, sRGB."""
+        return self.trial.error
 
 
 class Found(NamedTuple):
@@ -134,16 +134,6 @@ class Few:
         return 1.0 / np.max(ratios, axis=0)
 
 
-def unexplained(error: float, floor: float) -> bool:
-    """Returns whether the error of the best single solid calls for a search of what is inside.
-
-    Args:
-      error: mean robust error of pixels through the object (`gauss_newton.errors_of`).
-      floor: mean robust error of pixels beside it, which see the backdrop directly.
-    """
-    return error > _UNEXPLAINED * floor
-
-
 def search(
     outer: Revolution,
     surface: Backdrop,
@@ -181,15 +171,18 @@ def search(
         say(f"{rough[-1].name}: looked {found.error:.4f}, error {rough[-1].error:.4f}")
     for each in _best_of_kinds(rough, settings):
         interior = _with_gap(outer, each, surface, pixels, settings)
-        start = _started(Vessel(outer, interior, detail))
-        findings.append(_fitted(start, surface, pixels, judges, settings, settings.all, outlines))
+        vessel = Vessel(outer, interior, detail)
+        start, steps = vessel.start(), settings.all
+        fitted = _fitted(vessel, start, surface, pixels, judges, settings, steps, outlines)
+        findings.append(fitted)
         say(f"{interior.name}: all unknowns, error {findings[-1].error:.4f}")
     steps = settings.last
     for number in _close(findings, settings) if steps else []:
-        last = _fitted(findings[number], surface, pixels, judges, settings, steps, outlines)
+        vessel, x = findings[number].vessel, findings[number].x
+        last = _fitted(vessel, x, surface, pixels, judges, settings, steps, outlines)
         say(f"{last.name}: further steps, error {last.error:.4f}")
         findings[number] = last
-    return Found(select(findings, surface, judges), findings, looks)
+    return Found(_simplest(findings), findings, looks)
 
 
 def _close(findings: Sequence[Finding], settings: SearchSettings) -> list[int]:
@@ -217,16 +210,14 @@ def _few_fitted(
     few = Few(vessel, x, np.stack(columns, axis=1))
     steps = Steps(settings.few, settings.rays, settings.rays, _OUTLIERS, seed=settings.seed)
     fit = gauss_newton.fit(few, few.start(), surface, pixels, settings=steps)
-    return _finding(vessel, few.whole(fit.x), fit.covariance, surface, judges)
-
-
-def _started(vessel: Vessel) -> Finding:
-    """Returns a vessel at rest."""
-    return Finding(vessel, vessel.start(), np.eye(vessel.layout.count), np.inf)
+    covariance = few.directions @ fit.covariance @ few.directions.T
+    whole = Fit(few.whole(fit.x), covariance, fit.steps)
+    return _finding(vessel, whole, surface, judges)
 
 
 def _fitted(
-    start: Finding,
+    vessel: Vessel,
+    x: Float[np.ndarray, " unknowns"],
     surface: Backdrop,
     pixels: Photographs,
     judges: Photographs,
@@ -235,21 +226,15 @@ def _fitted(
     outlines: Callable[[Candidate], Rows] | None,
 ) -> Finding:
     """Returns a hypothesis after steps of all unknowns."""
-    vessel, seed = start.vessel, settings.seed + len(blurs)
+    seed = settings.seed + len(blurs)
     steps = Steps(blurs, settings.last_rays, settings.rays, _OUTLIERS, seed=seed)
-    fit = gauss_newton.fit(vessel, start.x, surface, pixels, settings=steps, outlines=outlines)
-    return _finding(vessel, fit.x, fit.covariance, surface, judges)
+    fit = gauss_newton.fit(vessel, x, surface, pixels, settings=steps, outlines=outlines)
+    return _finding(vessel, fit, surface, judges)
 
 
-def _finding(
-    vessel: Vessel,
-    x: Float[np.ndarray, " unknowns"],
-    covariance: Float[np.ndarray, "few few"],
-    surface: Backdrop,
-    judges: Photographs,
-) -> Finding:
-    errors = gauss_newton.errors_of(gauss_newton.traced_object(vessel.pose(x)), surface, judges)
-    return Finding(vessel, x, covariance, float(errors.mean()))
+def _finding(vessel: Vessel, fit: Fit, surface: Backdrop, judges: Photographs) -> Finding:
+    name = f"vessel: {vessel.interior_at_start.name}"
+    return Finding(vessel, judged(name, vessel, fit, surface, judges))
 
 
 def _with_wall(finding: Finding) -> Interior:
@@ -278,7 +263,7 @@ def _with_gap(
     if not at.level_unknown:
         return at
     generator = np.random.default_rng(settings.seed + 1)
-    some = pixels.chosen(draw(generator, len(pixels.views), settings.pixels))
+    some = pixels.drawn(generator, settings.pixels)
     blurred = photometry.blurred(surface, _GAP_BLUR)
     found = [look(outer, at, blurred, some)]
     for gap in _GAPS:
@@ -298,28 +283,7 @@ def _best_of_kinds(findings: Sequence[Finding], settings: SearchSettings) -> lis
     return sorted(kept, key=lambda each: len(each.x))
 
 
-def select(findings: Sequence[Finding], surface: Backdrop, judges: Photographs) -> Finding:
-    """Returns the simplest finding whose error is not significantly above the least.
-
-    It must not be worse than the best by more than two standard errors of the mean over views.
-
-    Args:
-      findings: findings, the simplest first.
-      surface: backdrop.
-      judges: pixels that none was fitted to.
-    """
-    errors = [
-        gauss_newton.errors_of(
-            gauss_newton.traced_object(each.vessel.pose(each.x)), surface, judges
-        )
-        for each in findings
-    ]
-    best = errors[int(np.argmin([each.mean() for each in errors]))]
-    _, view = np.unique(judges.views, return_inverse=True)
-    counts = np.bincount(view)
-    for finding, error in zip(findings, errors, strict=True):
-        worse = np.bincount(view, error - best) / counts
-        deviation = np.std(worse, ddof=1) / np.sqrt(len(counts)) if len(counts) > 1 else 0.0
-        if worse.mean() <= _WORSE * deviation:
-            return finding
-    return findings[int(np.argmin([each.error for each in findings]))]
+def _simplest(findings: Sequence[Finding]) -> Finding:
+    """Returns the finding of the trial that `model_selection.choose` keeps."""
+    chosen = choose([each.trial for each in findings])
+    return next(each for each in findings if each.trial is chosen)

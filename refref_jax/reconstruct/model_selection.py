@@ -38,7 +38,7 @@ class Trial(NamedTuple):
     """One model, fitted.
 
     Attributes:
-      name: what it is, in words.
+      name: kind of the model, in words.
       model: the model.
       fit: its unknowns, their covariance, and what the steps did.
       by_view: mean robust error of the judges of each view, sRGB.
@@ -83,7 +83,7 @@ def judged(
     """Returns a fitted model with the errors of the judges.
 
     Args:
-      name: what the model is, in words.
+      name: kind of the model, in words.
       model: the model.
       fit: its unknowns.
       surface: backdrop.

@@ -96,6 +96,11 @@ class Photographs(NamedTuple):
         """Returns some of the pixels."""
         return jax.tree.map(lambda x: numerics.host_array(np.asarray(x)[some]), self)
 
+    def drawn(self, generator: np.random.Generator, count: int) -> "Photographs":
+        """Returns pixels that are drawn without repetition, all if there are no more."""
+        every = len(self.views)
+        return self.chosen(generator.choice(every, min(count, every), replace=False))
+
 
 class TracedObject(NamedTuple):
     """A scene on the device, and the faces that its primitives are.

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from trimesh import Trimesh
 from trimesh.remesh import subdivide_to_size
 
@@ -210,8 +210,8 @@ class _Glass:
         self.model = SingleObject(FixedShape(mesh), INDEX_OF_AIR, deviation=1.0)
         self.traced = gauss_newton.traced_object(self.model.pose(self.model.start()))
         self.surface = surface
-        self.few = pixels.chosen(_spread(len(pixels.views), _LOOK, seed))
-        self.many = pixels.chosen(_spread(len(pixels.views), 4 * _LOOK, seed))
+        self.few = pixels.drawn(np.random.default_rng((seed, _LOOK)), _LOOK)
+        self.many = pixels.drawn(np.random.default_rng((seed, 4 * _LOOK)), 4 * _LOOK)
 
     def at(self, index: float) -> TracedObject:
         """Returns the scene with an index."""
@@ -245,11 +245,6 @@ class _Glass:
             for side in (-1.0, 0.0, 1.0)
         ]
         return scatter_of_bottoms(np.stack(triple), self.many.views, _APART)
-
-
-def _spread(every: int, count: int, seed: int) -> Int[np.ndarray, " some"]:
-    """Draws some of many."""
-    return np.random.default_rng((seed, count)).choice(every, min(every, count), replace=False)
 
 
 def fit_shapes(

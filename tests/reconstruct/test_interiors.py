@@ -13,7 +13,7 @@ from refref_jax.reconstruct import ReconstructionError, gauss_newton, interior_l
 from refref_jax.reconstruct.contents import Detail, Interior
 from refref_jax.reconstruct.families import Revolution, fit_revolution
 from refref_jax.reconstruct.interior_looks import SearchSettings, hypotheses, look
-from refref_jax.reconstruct.interior_search import Few, Finding, select, unexplained
+from refref_jax.reconstruct.interior_search import Few, _finding, _simplest
 from refref_jax.reconstruct.interiors import Vessel
 from refref_jax.reconstruct.mesh_distance import signed_distance
 from refref_jax.reconstruct.photometry import Backdrop, Photographs
@@ -147,11 +147,6 @@ def test_hypotheses_begin_with_the_simplest(body):
     assert counts == sorted(counts)
 
 
-def test_only_large_errors_call_for_a_search():
-    assert unexplained(0.15, 0.02)
-    assert not unexplained(0.03, 0.02)
-
-
 @pytest.fixture(scope="module")
 def surface():
     """A sphere of smooth random radiance."""
@@ -213,11 +208,11 @@ def test_the_simplest_of_equally_good_findings_is_kept(body, surface, photograph
     def finding(interior):
         vessel = Vessel(body, interior, _SMALL)
         x = vessel.start()
-        return Finding(vessel, x, np.eye(len(x)), 0.0)
+        return _finding(vessel, gauss_newton.Fit(x, np.eye(len(x)), ()), surface, photographs)
 
     simple, stained = finding(_FLASK), finding(dataclasses.replace(_FLASK, stained=True))
     wrong = finding(Interior("liquid", wall=0.12))
-    assert select([wrong, simple, stained], surface, photographs) is simple
+    assert _simplest([wrong, simple, stained]) is simple
 
 
 def test_looks_leave_out_walls_that_fill_the_vessel(body, surface, photographs):
