@@ -19,7 +19,12 @@ from experiments.r3f import index_stage
 from refref_jax.data import image_files, scene_folder
 from refref_jax.geometry.cameras import pixel_rays
 from refref_jax.geometry.triangle_meshes import Mesh, make_mesh
-from refref_jax.reconstruct import gauss_newton, photometry, shape_from_refraction
+from refref_jax.reconstruct import (
+    gauss_newton,
+    model_selection,
+    photometry,
+    shape_from_refraction,
+)
 from refref_jax.reconstruct.mesh_distance import silhouettes
 from refref_jax.reconstruct.photometry import Backdrop, Photographs
 from refref_jax.reconstruct.shapes import FixedShape
@@ -49,12 +54,12 @@ def main(arguments: list[str]) -> None:
     fitted = _photograph(dented, surface, scene, "train", 0)
     judges = _photograph(dented, surface, scene, "val", 1)
     trials = shape_from_refraction.fit_shapes(plain, _INDEX, surface, fitted, judges)
-    chosen = shape_from_refraction.choose(trials)
+    chosen = model_selection.choose(trials)
     print("| surface | depth, share of the true one | normals in the dent, degrees | index |")
     print("|---|---|---|---|")
     for name, mesh, index in (
         ("from masks", plain, _INDEX),
-        (chosen.name, chosen.mesh, chosen.index),
+        (chosen.name, chosen.mesh, chosen.outer_index),
     ):
         depth = _depth(mesh) / _depth(dented)
         print(f"| {name} | {depth:.3f} | {_angle(mesh, dented):.2f} | {index:.4f} |")
