@@ -1,6 +1,6 @@
 """Claim: light finds 80 % of the depth of a dent that no silhouette shows.
 
-    python -m benchmarks.r3f_dent [--slope=4.7] [--views=60] [--size=128]
+    python -m benchmarks.r3f_dent [--slope=4.7] [--width=0.44]
 
 A ball of glass has a smooth dent, too shallow for the outline of any view. Its photographs are
 rendered here, in front of the backdrop that is solved for from the bundled scene, with noise of one
@@ -30,7 +30,7 @@ from refref_jax.reconstruct.photometry import Backdrop, Photographs
 from refref_jax.reconstruct.shapes import FixedShape
 
 _SLOPE = flags.DEFINE_float("slope", 4.7, "Steepest slope of the dent, degrees.", 0.0)
-_WIDTH = flags.DEFINE_float("width", 0.25, "Standard deviation of the dent, world units.", 0.01)
+_WIDTH = flags.DEFINE_float("width", 0.44, "Standard deviation of the dent, world units.", 0.01)
 _NOISE = flags.DEFINE_float("noise", 0.01, "Standard deviation of the pixels' noise, sRGB.", 0.0)
 _SCENE = flags.DEFINE_string("scene", "experiments/data/cube_smcvx_ball", "World and cameras.")
 _OUT = flags.DEFINE_string("out", "runs/r3f_dent", "Folder of the backdrop.")

@@ -16,7 +16,8 @@ The inverse of the matrix is the covariance of the unknowns, if errors of pixels
 Those of one view are not: a backdrop that is a little off shifts them alike. The scatter of the
 gradients of whole views says by how much the covariance is too small.
 
-Sources: Geman and McClure (1987), robust weights; Levenberg (1944) and Marquardt (1963), damping;
+Sources: Geman and McClure (1987), robust weights; Blake and Zisserman (1987) and Black and
+Rangarajan (1996), weights that are wide at first; Levenberg (1944) and Marquardt (1963), damping;
 Liang and Zeger (1986), covariance from clusters of errors, here views;
 Wu, Zhou, Qian, Gong, Huang: Full 3D Reconstruction of Transparent Objects (2018), for shape from
 refracted light; the sparse Jacobian through traced triangles is ours.
@@ -47,6 +48,9 @@ _CAP = 0.15
 # Smallest scale of the robust weights, in sRGB, and its ratio to the median error; smallest typical
 # error, near the rounding of 8 bits.
 _LEAST_SCALE, _SCALE, _LEAST_NOISE = 0.02, 1.5, 0.005
+
+# Factor of the least scale from step to step.
+_NARROWING = 0.9
 
 # sRGB of saturated pixels, which may be brighter than they look.
 _SATURATED = 254.5 / 255.0
@@ -119,6 +123,9 @@ class Steps:
       outliers: share of the pixels of largest derivatives that are left out.
       least: largest change of an unknown, relative to its scale, below which the fit has ended.
       seed: seed of the draws.
+      widest: least scale of the robust weights in the first step, sRGB; it falls by a tenth in
+        each. Without it, a fault that few pixels see has no weight.
+      gain: least relative gain; the fit ends after two steps in a row, without blur, of less.
     """
 
     blurs: tuple[int, ...] = (2, 1, 0, 0, 0, 0)
@@ -127,6 +134,8 @@ class Steps:
     outliers: float = 0.01
     least: float = 1e-3
     seed: int = 0
+    widest: float = 0.0
+    gain: float = 0.0
 
 
 class StepFacts(NamedTuple):
@@ -243,7 +252,8 @@ def fit(
         seen = photometry.blurred(surface, blur)
         candidate = model.pose(x)
         traced = traced_object(candidate)
-        light = linearise(candidate, traced, seen, draw(settings.rays), settings)
+        scale = settings.widest * _NARROWING**number
+        light = linearise(candidate, traced, seen, draw(settings.rays), settings, scale)
         if outlines is not None:
             light = _with_rows(light, outlines(candidate))
         x, damping, fact = _step(
@@ -252,10 +262,19 @@ def fit(
         facts.append(fact)
         if progress is not None:
             progress(number + 1, fact)
-        if blur == 0 and fact.taken and fact.change < settings.least:
+        if _has_ended(facts, settings):
             break
     precision, _ = model.prior(x)
     return Fit(x, _covariance(light, precision), tuple(facts))
+
+
+def _has_ended(facts: Sequence[StepFacts], settings: Steps) -> bool:
+    """Returns whether further steps would change little."""
+    last = facts[-1]
+    if last.blur == 0 and last.taken and last.change < settings.least:
+        return True
+    slow = [each.blur == 0 and each.after > (1.0 - settings.gain) * each.before for each in facts]
+    return settings.gain > 0.0 and len(slow) > 1 and all(slow[-2:])
 
 
 def _step(
@@ -323,6 +342,7 @@ def linearise(
     surface: Backdrop,
     pixels: Photographs,
     settings: Steps,
+    scale: float = 0.0,
 ) -> Equations:
     """Returns the normal equations of some pixels.
 
@@ -332,6 +352,7 @@ def linearise(
       surface: backdrop.
       pixels: some pixels.
       settings: settings of the fit, of which the share of outliers counts.
+      scale: least scale of the robust weights, sRGB.
     """
     predicted = photometry.predict(traced, surface, pixels.rays)
     found = photometry.sensitivities(traced, surface, pixels.rays, predicted)
@@ -340,7 +361,7 @@ def linearise(
     slopes = found.slopes * encode[:, None]
     coordinates = _by_unknowns(candidate, traced, found)
     usable = found.usable & (predicted.dropped < 1.0 - _FOLLOWED) & (found.coverage > _SEEN)
-    weights = _robust_weights(error, usable)
+    weights = _robust_weights(error, usable, max(scale, _LEAST_SCALE))
     weights = weights * _unsaturated(predicted.linear, pixels.rgb)
     jacobian = _block_diagonal(np.swapaxes(slopes, 1, 2)) @ coordinates
     if candidate.by_tints.shape[0]:
@@ -438,11 +459,11 @@ def _by_tints(
 
 
 def _robust_weights(
-    error: Float[np.ndarray, "rays 3"], usable: np.ndarray
+    error: Float[np.ndarray, "rays 3"], usable: np.ndarray, least: float
 ) -> Float[np.ndarray, "rays 3"]:
     """Returns Geman-McClure weights: pixels that something else explains lose theirs."""
     size = np.sqrt(np.mean(error**2, axis=1))
-    scale = max(_LEAST_SCALE, _SCALE * float(np.median(size[usable]))) if usable.any() else 1.0
+    scale = max(least, _SCALE * float(np.median(size[usable]))) if usable.any() else 1.0
     weight = usable / (1.0 + (size / scale) ** 2) ** 2
     return np.repeat(weight[:, None], 3, axis=1)
 

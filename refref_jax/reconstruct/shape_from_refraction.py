@@ -53,8 +53,9 @@ _LOOK, _LOOK_BLUR, _INDEX_BLURS = 8192, 2, (2, 1, 0, 0)
 _APART = 0.01
 
 # Lengths over which a free surface is smoothed before each group of steps: noise that the handles
-# cannot remove; world units of a body of diameter 2.6. Steps of each group, without blur.
-_SMOOTHINGS, _GROUPS = (0.05, 0.02, 0.02), (2, 2, 2)
+# cannot remove; world units of a body of diameter 2.6. Steps of each group, without blur, scale of
+# the robust weights in the first step, and gain of two steps below which a group ends.
+_SMOOTHINGS, _GROUPS, _WIDEST, _GAIN = (0.05, 0.02, 0.02), (2, 2, 10), 0.3, 0.01
 
 # Steps of families with few unknowns, without blur, and the pixels of each.
 _FAMILY_STEPS, _FAMILY_RAYS = 4, 20_000
@@ -366,12 +367,16 @@ def _fit_free(
     """Fits a free surface, from the mesh of masks or from a family."""
     mesh, index, done = _with_many_vertices(start.mesh), start.outer_index, 0
     smoothings = _SMOOTHINGS if start.name == "masks" else (0.0,)
-    for number, smoothing in enumerate(smoothings):
+    groups = zip(smoothings, _GROUPS[-len(smoothings) :], strict=True)
+    for number, (smoothing, count) in enumerate(groups):
+        widest = _WIDEST if number == len(smoothings) - 1 else 0.0
         if smoothing:
             mesh = diffuse(mesh, smoothing * diameter(mesh.vertices) / _STATED_FOR)
         model = SingleObject(FreeSurface(mesh), index, deviation=task.deviation)
         coarse = tuple(range(blur, 0, -1)) if number == 0 else ()
-        settings = Steps((*coarse, *[0] * _GROUPS[number]), seed=task.seed + number)
+        settings = Steps(
+            (*coarse, *[0] * count), seed=task.seed + number, widest=widest, gain=_GAIN
+        )
         fit = task.fit(model, settings, functools.partial(_later, progress, done))
         done += len(settings.blurs)
         mesh, index = model.mesh(fit.x), model.index_of(fit.x)

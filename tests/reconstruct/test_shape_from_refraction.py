@@ -381,6 +381,26 @@ def test_a_free_surface_loses_a_dent_that_no_outline_shows(world, ball, seen, ju
     assert np.all(np.isfinite(deviations)) and 0.0 < np.median(deviations) < 1.0
 
 
+def test_a_wide_scale_weighs_a_fault_that_few_pixels_see(world, glass, seen):
+    few = np.zeros(len(seen.views), bool)
+    few[::20] = True
+    other = _see_ball(world, seen.rays, index=_INDEX + 0.08)
+    rgb = np.where(few[:, None], photometry.encode(other), seen.rgb)
+    candidate = glass.pose(glass.start())
+    body = gauss_newton.traced_object(candidate)
+    narrow, wide = (
+        gauss_newton.linearise(candidate, body, world, seen._replace(rgb=rgb), Steps(), scale)
+        for scale in (0.0, 0.5)
+    )
+    steps = [-each.gradient[-1] / each.matrix[-1, -1] for each in (narrow, wide)]
+    assert 0.0 < 3.0 * steps[0] < steps[1] < 0.02
+
+
+def test_a_fit_ends_after_two_steps_that_gain_little(world, glass, seen):
+    settings = Steps(blurs=(1, 0, 0, 0, 0), rays=2048, judges=1024, gain=0.9, least=0.0)
+    assert len(gauss_newton.fit(glass, glass.start(), world, seen, settings=settings).steps) == 3
+
+
 def _one_family(monkeypatch, shape, mesh):
     """Leaves one family and a coarse free surface, which are fitted in seconds."""
     coarse = functools.partial(FreeSurface, spacing=0.25)
