@@ -113,7 +113,7 @@ def run(
         return LightFacts(kept=False, index=known.index, remark=reason)
     seen = read(scene, seed=seed)
     trials = fit(scene, mesh, known, surface, seen, seed=seed)
-    masks, chosen, remark = _choose(mesh, trials)
+    masks, chosen, remark = choose(mesh, trials)
     kept = chosen is not masks
     deviations = model_selection.normal_deviations(chosen) if kept else None
     parts: tuple[PartFacts, ...] = ()
@@ -141,7 +141,7 @@ def run(
     )
 
 
-def _choose(mesh: Mesh, trials: Sequence[Trial]) -> tuple[Trial, Trial, str]:
+def choose(mesh: Mesh, trials: Sequence[Trial]) -> tuple[Trial, Trial, str]:
     """Returns the mesh from masks, the chosen trial, and the reason if both are the same.
 
     Trials that change the volume are left out; that of a vessel is of its glass alone, so that only
