@@ -46,7 +46,7 @@ def main(arguments: list[str]) -> None:
     del arguments
     scene, out = Path(_SCENE.value), Path(_OUT.value)
     out.mkdir(parents=True, exist_ok=True)
-    surface = index_stage.backdrop_of(out, index_stage.learn_background(scene, out, seed=0))
+    surface = index_stage.learn_backdrop(scene, out, seed=0)
     assert surface is not None, "the bundled scene has a backdrop"
     ball = trimesh.creation.icosphere(subdivisions=6, radius=_RADIUS)
     plain = make_mesh(np.asarray(ball.vertices), np.asarray(ball.faces, np.int64))

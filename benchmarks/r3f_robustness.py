@@ -6,7 +6,8 @@ The scene is reconstructed as it is, and with a fault in its inputs: half of its
 are a pixel too wide, one mask that is shifted, an index that is 0.03 off where the light begins.
 The table has the chosen shape, the index, and the angle between its normals and those of the
 scene's own mesh. In the last row all walls are grey: a clear object in front of them cannot be
-seen, so the surface must stay as the masks give it. Finished reconstructions are reused.
+seen, so its index is given, and the surface must stay as the masks give it. Finished
+reconstructions are reused.
 """
 
 import dataclasses
@@ -53,6 +54,7 @@ def main(arguments: list[str]) -> None:
         scene = _copy(name, change)
         out = scene.parent / "reconstruction"
         options = [f"--scene={scene}", f"--out={out}"]
+        options += ["--ior=1.5"] if change is _grey_walls else []
         subprocesses.run("reconstruct", *options, log=scene.parent / "reconstruct.log")
         found = records.read(out)
         wrong += _measured(name, out, found)
@@ -110,7 +112,7 @@ _FAULTS: dict[str, Callable[[Path], None]] = {
 
 def _measured(name: str, out: Path, found: records.Reconstruction) -> list[str]:
     """Prints a row, and returns what is out of bounds."""
-    assert found.light is not None, "light was asked for"
+    assert found.light is not None, "light was not left out"
     facts = object_source.index_facts(found)
     shape = found.light.shape if found.light.kept else f"masks: {found.light.remark}"
     mesh = object_source.read_mesh(out, found)
@@ -122,9 +124,8 @@ def _measured(name: str, out: Path, found: records.Reconstruction) -> list[str]:
 
 def _begun_off(scene: Path, out: Path, found: records.Reconstruction) -> list[str]:
     """Begins the light with a wrong index; prints a row, and returns what is out of bounds."""
-    surface = index_stage.backdrop_of(
-        out / "index", index_stage.learn_background(scene, out / "index", seed=0)
-    )
+    surface = index_stage.learn_backdrop(scene, out / "index", seed=0)
+    assert surface is not None and found.index is not None, "it was reconstructed before a backdrop"
     masks = object_source.read_mesh(out, dataclasses.replace(found, light=None))
     seen = light_stage.read(scene, seed=0)
     known = dataclasses.replace(found.index, index=found.index.index + _OFF)
@@ -137,7 +138,7 @@ def _begun_off(scene: Path, out: Path, found: records.Reconstruction) -> list[st
 def _row(name: str, shape: str, index: float, deviation: float | None, mesh: Mesh) -> list[str]:
     part = meshes.read_meshes(Path(_SCENE.value))[0]
     distance = compare_meshes(mesh, shaded_mesh(part))
-    bar = "" if deviation is None else f" ± {deviation:.4f}"
+    bar = "" if deviation is None else f" ± {deviation:.5f}"
     angles = f"{distance.normal_error:.3f}, {distance.normal_error_99:.2f}"
     print(f"| {name} | {shape} | {index:.4f}{bar} | {angles} |", flush=True)
     within = {

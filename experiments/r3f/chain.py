@@ -198,7 +198,7 @@ def _refined(scene: Path, out: Path, found: Reconstruction, say: Say) -> Reconst
 def _light(scene: Path, out: Path, found: Reconstruction) -> LightFacts:
     folder, seed = out / _INDEX_FOLDER, found.config.seed
     folder.mkdir(exist_ok=True)
-    background = index_stage.learn_background(
+    surface = index_stage.learn_backdrop(
         scene,
         folder,
         seed=seed,
@@ -210,7 +210,7 @@ def _light(scene: Path, out: Path, found: Reconstruction) -> LightFacts:
         scene,
         object_source.read_mesh(out, found),
         found.index,
-        index_stage.backdrop_of(folder, background),
+        surface,
         out / light_stage.FOLDER / found.geometry.mesh,
         seed=seed,
     )

@@ -42,7 +42,7 @@ from refref_jax.render.checkpoint_io import SavedModel
 from refref_jax.render.model import Model, ModelConfig, surface_of
 from refref_jax.training import fit, run_folder
 from refref_jax.training.config import TrainConfig, require
-from refref_jax.training.resolve import read_facts, resolve
+from refref_jax.training.resolve import Resolved, read_facts, resolve
 
 PRESET = "tiny"
 """Preset of the background's model, whose field is only queried."""
@@ -218,7 +218,39 @@ def learn_background(
         started with another background.
       KeyboardInterrupt: if its training was stopped; it has been saved.
     """
-    run = folder / BACKGROUND
+    background = {"space": space, "radius": radius, "centre": centre}
+    wanted = _resolved(scene, folder / BACKGROUND, seed=seed, steps=steps, **background)
+    return _learned(scene, folder / BACKGROUND, wanted)
+
+
+def learn_backdrop(
+    scene: Path,
+    folder: Path,
+    *,
+    seed: int,
+    space: Space | None = None,
+    radius: float | None = None,
+    centre: Position | None = None,
+) -> Backdrop | None:
+    """Returns the backdrop, as `learn_background`; `None`, without training, if it is a field."""
+    background = {"space": space, "radius": radius, "centre": centre}
+    wanted = _resolved(scene, folder / BACKGROUND, seed=seed, steps=STEPS, **background)
+    if wanted.model.config.backdrop is None:
+        return None
+    return backdrop_of(folder, _learned(scene, folder / BACKGROUND, wanted))
+
+
+def _resolved(
+    scene: Path,
+    run: Path,
+    *,
+    seed: int,
+    space: Space | None,
+    radius: float | None,
+    centre: Position | None,
+    steps: int,
+) -> Resolved:
+    """Returns how the background is to be learned."""
     config = TrainConfig().override(
         scene=str(scene.resolve()),
         pixels="background",
@@ -231,15 +263,20 @@ def learn_background(
     facts = read_facts(config.scene, parts=())
     wanted = resolve(config, facts)
     begun = checkpoint_io.read_static(run).config if run_folder.exists(run) else wanted.model.config
-    if wanted.model.config.backdrop is None or begun.backdrop is None:
-        field = {"far_field": "field", "preset": PRESET, "footprint": "cone", "steps": steps}
-        wanted = resolve(config.override(**field), facts)
+    if wanted.model.config.backdrop is not None and begun.backdrop is not None:
+        return wanted
+    field = {"far_field": "field", "preset": PRESET, "footprint": "cone", "steps": steps}
+    return resolve(config.override(**field), facts)
+
+
+def _learned(scene: Path, run: Path, wanted: Resolved) -> Model:
+    """Learns the background, or resumes it."""
     if not run_folder.exists(run):
         empty = assemble_scene([], [], rule="nested")
         run_folder.create(run, wanted.config, wanted.model, empty)
     _refuse_another(run, checkpoint_io.read_static(run), wanted.model)
     solves = wanted.model.config.backdrop is not None
-    total = require(wanted.config.model.iterations) if solves else steps
+    total = require(wanted.config.model.iterations if solves else wanted.config.schedule.steps)
     with app.Interrupt() as interrupt, ProgressBar("solve" if solves else "train", total) as bar:
         ended = fit.train(
             run,

@@ -24,6 +24,7 @@ from refref_jax.reconstruct.polyhedra import fit_polyhedron
 from refref_jax.reconstruct.revolution import (
     Axis,
     Curve,
+    Fit,
     Profile,
     find_axis,
     fit_axis_and_profile,
@@ -403,12 +404,15 @@ def _torus_distances(
     return np.hypot(around, points[:, 2]) - unknowns[6]
 
 
-def fit_revolution(mesh: Mesh, *, furthest: float = FURTHEST) -> Revolution | None:
+def fit_revolution(
+    mesh: Mesh, *, furthest: float = FURTHEST, smooth: Fit | None = None
+) -> Revolution | None:
     """Fits a surface of revolution: see `revolution.fit_axis_and_profile`.
 
     Args:
       mesh: closed mesh, in one piece.
       furthest: largest rms distance of the mesh from the body, as a share of its diameter.
+      smooth: what `revolution.fit_axis_and_profile` found, if it is known.
 
     Returns:
       The body, or `None` if the mesh is further from it.
@@ -417,11 +421,11 @@ def fit_revolution(mesh: Mesh, *, furthest: float = FURTHEST) -> Revolution | No
       ReconstructionError: if the mesh is empty, flat, inside out or not finite, or
         scikit-image is not installed.
     """
-    cloud, size = cloud_of(mesh), diameter(mesh.vertices)
-    fit = fit_axis_and_profile(mesh, cloud, size)
-    if fit is None or fit.rms > furthest * size:
+    size = diameter(mesh.vertices)
+    smooth = fit_axis_and_profile(mesh, cloud_of(mesh), size) if smooth is None else smooth
+    if smooth is None or smooth.rms > furthest * size:
         return None
-    return Revolution(fit.axis, fit.profile, size)
+    return Revolution(smooth.axis, smooth.profile, size)
 
 
 def candidates(mesh: Mesh) -> list[Shape]:
@@ -436,12 +440,9 @@ def candidates(mesh: Mesh) -> list[Shape]:
       ReconstructionError: if the mesh is empty, flat, inside out or not finite, or
         scikit-image is not installed.
     """
-    fits = (
-        fit_sphere(mesh),
-        fit_torus(mesh),
-        fit_turned(mesh),
-        fit_revolution(mesh),
-        fit_polyhedron(mesh),
-    )
+    fits: list[Shape | None] = [fit_sphere(mesh), fit_torus(mesh), fit_polyhedron(mesh)]
+    smooth = fit_axis_and_profile(mesh, cloud_of(mesh), diameter(mesh.vertices))
+    if smooth is not None:
+        fits += [fit_turned(mesh, smooth=smooth), fit_revolution(mesh, smooth=smooth)]
     found: list[Shape] = [fit for fit in fits if fit is not None]
     return [*sorted(found, key=lambda shape: len(shape.start())), FreeSurface(mesh)]

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from trimesh import Trimesh
 from trimesh.remesh import subdivide_to_size
 
-from refref_jax.geometry.triangle_meshes import Mesh, diameter, make_mesh
+from refref_jax.geometry.triangle_meshes import Mesh, diameter, make_mesh, smooth_groups
 from refref_jax.optics.interface_rules import NO_PARENT, nested
 from refref_jax.optics.media import INDEX_OF_AIR
 from refref_jax.reconstruct import ReconstructionError, families, gauss_newton, photometry
@@ -56,6 +56,9 @@ _APART = 0.01
 # cannot remove; world units of a body of diameter 2.6. Steps of each group, without blur, scale of
 # the robust weights in the first step, and gain of two steps below which a group ends.
 _SMOOTHINGS, _GROUPS, _WIDEST, _GAIN = (0.05, 0.02, 0.02), (2, 2, 10), 0.3, 0.01
+
+# Share of the vertices that have several normals, above which a mesh has creases.
+_CREASED = 0.02
 
 # Steps of families with few unknowns, without blur, and the pixels of each.
 _FAMILY_STEPS, _FAMILY_RAYS = 4, 20_000
@@ -370,7 +373,7 @@ def _fit_free(
     groups = zip(smoothings, _GROUPS[-len(smoothings) :], strict=True)
     for number, (smoothing, count) in enumerate(groups):
         widest = _WIDEST if number == len(smoothings) - 1 else 0.0
-        if smoothing:
+        if smoothing and not _has_creases(mesh):
             mesh = diffuse(mesh, smoothing * diameter(mesh.vertices) / _STATED_FOR)
         model = SingleObject(FreeSurface(mesh), index, deviation=task.deviation)
         coarse = tuple(range(blur, 0, -1)) if number == 0 else ()
@@ -381,6 +384,12 @@ def _fit_free(
         done += len(settings.blurs)
         mesh, index = model.mesh(fit.x), model.index_of(fit.x)
     return task.judged(model.shape.name, model, fit)
+
+
+def _has_creases(mesh: Mesh) -> bool:
+    """Returns whether vertices have several normals; smoothing would round these edges."""
+    groups = smooth_groups(mesh.vertices, mesh.faces)
+    return groups.max() + 1 > (1.0 + _CREASED) * len(np.unique(mesh.faces))
 
 
 def _with_many_vertices(mesh: Mesh) -> Mesh:

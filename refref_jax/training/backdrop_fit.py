@@ -177,6 +177,11 @@ def _read(
     images, among = scene_folder.read_images(frames), None
     if config.scene.pixels == "background":
         among = image_files.well_outside(scene_folder.read_masks(frames))
+        if not among.any():
+            raise ValueError(
+                f"No pixel of the train views of {folder} lies outside the masks, so nothing shows "
+                "the background. Use images with room around the object, or check the masks."
+            )
     return _Problem(config, model, scene, frames, images, among, traced)
 
 

@@ -285,8 +285,7 @@ def _stub_light(monkeypatch, *, after, growth=1.001, index=1.51):
 
     monkeypatch.setattr(light_stage, "fit", fit)
     monkeypatch.setattr(light_stage, "draw", lambda path, *_: path.write_bytes(b"figure"))
-    monkeypatch.setattr(index_stage, "learn_background", lambda *_, **options: "background")
-    monkeypatch.setattr(index_stage, "backdrop_of", lambda folder, model: "surface")
+    monkeypatch.setattr(index_stage, "learn_backdrop", lambda *_, **options: "surface")
     return called
 
 
@@ -369,8 +368,7 @@ def test_a_body_that_light_blew_up_is_left_out(scene, monkeypatch, tmp_path):
 def test_before_a_field_there_is_no_refinement_by_light(scene, whole, tmp_path, monkeypatch):
     out = tmp_path / "out"
     shutil.copytree(whole, out)
-    monkeypatch.setattr(index_stage, "learn_background", lambda *_, **options: "background")
-    monkeypatch.setattr(index_stage, "backdrop_of", lambda folder, model: None)
+    monkeypatch.setattr(index_stage, "learn_backdrop", lambda *_, **options: None)
     monkeypatch.setattr(light_stage, "fit", None)  # would raise
     found = _run(scene, out, _LIT, compare=False)
     assert found.light == records.LightFacts(

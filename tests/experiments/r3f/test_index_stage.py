@@ -102,6 +102,13 @@ def test_a_background_that_was_begun_as_a_field_stays_one(ball_scene, tmp_path, 
     assert run_folder.read_config(tmp_path / "background") == begun
 
 
+def test_no_field_is_trained_where_only_a_backdrop_is_of_use(ball_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(fit, "train", None)  # would raise
+    scene = _unstated(ball_scene, tmp_path)
+    assert index_stage.learn_backdrop(scene, tmp_path, seed=3) is None
+    assert not (tmp_path / "background").exists()
+
+
 def test_a_background_that_was_begun_with_other_walls_is_not_taken(
     ball_scene, tmp_path, monkeypatch
 ):
