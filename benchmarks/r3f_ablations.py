@@ -1,0 +1,118 @@
+"""Claim: no part of the fit by light keeps the free surface away from the truth.
+
+    python -m benchmarks.r3f_ablations --reconstruction=OUT --scene=FOLDER
+
+OUT is a finished reconstruction of the scene. Its surface from masks is fitted again as a free
+surface, with all parts of the method and without one at a time: the blur of the backdrop, the rows
+of the outlines, robust weights that are wide at first, all robust weights, the index as an unknown,
+and the smoothing. The table has the angle between normals and the true ones, and the error of
+pixels that were not fitted.
+"""
+
+import dataclasses
+from pathlib import Path
+from typing import NamedTuple
+
+from absl import app, flags
+
+from experiments.r3f import index_stage, light_stage, object_source, records
+from refref_jax.data import meshes, scene_folder
+from refref_jax.data.scene_assembly import shaded_mesh
+from refref_jax.geometry.triangle_meshes import Mesh
+from refref_jax.reconstruct import gauss_newton, model_selection
+from refref_jax.reconstruct.gauss_newton import Steps
+from refref_jax.reconstruct.masks import Views
+from refref_jax.reconstruct.mesh_distance import compare_meshes
+from refref_jax.reconstruct.model_selection import Trial
+from refref_jax.reconstruct.outlines import Outlines
+from refref_jax.reconstruct.photometry import Backdrop
+from refref_jax.reconstruct.shape_from_refraction import SingleObject
+from refref_jax.reconstruct.shapes import FreeSurface
+from refref_jax.reconstruct.smoothing import diffuse
+
+_SCENE = flags.DEFINE_string("scene", None, "Folder of the scene.", required=True)
+_RECONSTRUCTION = flags.DEFINE_string("reconstruction", None, "Its reconstruction.", required=True)
+
+_STEPS = Steps((2, 1, *[0] * 8), widest=0.3)
+
+_SMOOTHING = 0.05
+"""Length over which the surface from masks is smoothed, world units."""
+
+_EVEN = 1e3
+"""Scale of the robust weights at which all pixels have the same, sRGB."""
+
+
+class Variant(NamedTuple):
+    """What a fit has.
+
+    Attributes:
+      steps: settings of the steps.
+      outlines: whether the masks' outlines are fitted.
+      deviation: standard deviation of the index's prior; 0 keeps it.
+      smoothing: length over which the surface is smoothed at first, world units.
+    """
+
+    steps: Steps = _STEPS
+    outlines: bool = True
+    deviation: float = 0.02
+    smoothing: float = _SMOOTHING
+
+
+_VARIANTS = {
+    "all parts": Variant(),
+    "no blur": Variant(dataclasses.replace(_STEPS, blurs=(0,) * len(_STEPS.blurs))),
+    "no outlines": Variant(outlines=False),
+    "narrow robust weights": Variant(dataclasses.replace(_STEPS, widest=0.0)),
+    "no robust weights": Variant(dataclasses.replace(_STEPS, widest=_EVEN)),
+    "index fixed": Variant(deviation=0.0),
+    "no smoothing": Variant(smoothing=0.0),
+}
+
+
+def main(arguments: list[str]) -> None:
+    del arguments
+    scene, out = Path(_SCENE.value), Path(_RECONSTRUCTION.value)
+    found = dataclasses.replace(records.read(out), light=None)
+    assert found.index is not None, "the reconstruction is finished"
+    surface = index_stage.learn_backdrop(scene, out / "index", seed=0)
+    assert surface is not None, "the scene has a backdrop"
+    mesh, seen = object_source.read_mesh(out, found), light_stage.read(scene, seed=0)
+    truth = shaded_mesh(meshes.read_meshes(scene)[0])
+    print("| fit | error, sRGB | index | normals, degrees: mean, 99 % |\n|---|---|---|---|")
+    errors = {}
+    for name, variant in _VARIANTS.items():
+        trial = _fitted(scene, mesh, found.index.index, surface, seen, variant)
+        distance = compare_meshes(trial.mesh, truth)
+        angles = f"{distance.normal_error:.3f}, {distance.normal_error_99:.2f}"
+        print(f"| {name} | {trial.error:.4f} | {trial.outer_index:.4f} | {angles} |", flush=True)
+        errors[name] = distance.normal_error
+    worse = [name for name, error in errors.items() if error < 0.9 * errors["all parts"]]
+    assert not worse, f"better by more than a tenth: {', '.join(worse)}"
+
+
+def _fitted(
+    scene: Path,
+    mesh: Mesh,
+    index: float,
+    surface: Backdrop,
+    seen: light_stage.Seen,
+    variant: Variant,
+) -> Trial:
+    """Fits a free surface."""
+    frames = scene_folder.read_frames(scene, "train")
+    outlines = Outlines(Views(scene_folder.read_masks(frames), frames.cameras), seed=0)
+    rest = diffuse(mesh, variant.smoothing) if variant.smoothing else mesh
+    model = SingleObject(FreeSurface(rest), index, deviation=variant.deviation)
+    fit = gauss_newton.fit(
+        model,
+        model.start(),
+        surface,
+        seen.fitted,
+        settings=variant.steps,
+        outlines=outlines if variant.outlines else None,
+    )
+    return model_selection.judged("free surface", model, fit, surface, seen.judges)
+
+
+if __name__ == "__main__":
+    app.run(main)
