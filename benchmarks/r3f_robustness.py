@@ -130,7 +130,7 @@ def _begun_off(scene: Path, out: Path, found: records.Reconstruction) -> list[st
     seen = light_stage.read(scene, seed=0)
     known = dataclasses.replace(found.index, index=found.index.index + _OFF)
     trials = light_stage.fit(scene, masks, known, surface, seen, seed=0)
-    chosen = light_stage.choose(masks, trials)[1]
+    chosen = light_stage.choose(scene, masks, trials)[1]
     name = f"index begun {_OFF:g} off"
     return _row(name, chosen.name, chosen.outer_index, chosen.index_deviation, chosen.mesh)
 

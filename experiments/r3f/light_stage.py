@@ -30,7 +30,7 @@ from refref_jax.data import meshes, scene_folder
 from refref_jax.data.scene_folder import Frames
 from refref_jax.geometry.cameras import image_rays
 from refref_jax.geometry.surfaces import pack_meshes
-from refref_jax.geometry.triangle_meshes import Mesh
+from refref_jax.geometry.triangle_meshes import Mesh, face_vectors, volume
 from refref_jax.reconstruct import (
     ReconstructionError,
     families,
@@ -71,8 +71,12 @@ _MATERIALS = [
     (name, meshes.INDEX_OF_REFRACTION[name]) for name in ("glass", "water", "alcohol", "air")
 ]
 
-# Share of the volume that the refinement may change: it corrects normals, not outlines.
+# Share of the volume that the refinement may change if pixels are small: it corrects normals, and
+# outlines by a pixel.
 _VOLUME_CHANGE = 0.02
+
+# Standard deviation of how much too wide all masks are, pixels.
+_WIDER = 0.5
 
 # Rows of the figure, and largest error and deviation that it distinguishes, in sRGB and degrees.
 _ROWS, _MOST_ERROR, _MOST_DEVIATION = 3, 0.2, 0.5
@@ -113,7 +117,7 @@ def run(
         return LightFacts(kept=False, index=known.index, remark=reason)
     seen = read(scene, seed=seed)
     trials = fit(scene, mesh, known, surface, seen, seed=seed)
-    masks, chosen, remark = choose(mesh, trials)
+    masks, chosen, remark = choose(scene, mesh, trials)
     kept = chosen is not masks
     deviations = model_selection.normal_deviations(chosen) if kept else None
     parts: tuple[PartFacts, ...] = ()
@@ -141,15 +145,16 @@ def run(
     )
 
 
-def choose(mesh: Mesh, trials: Sequence[Trial]) -> tuple[Trial, Trial, str]:
+def choose(scene: Path, mesh: Mesh, trials: Sequence[Trial]) -> tuple[Trial, Trial, str]:
     """Returns the mesh from masks, the chosen trial, and the reason if both are the same.
 
     Trials that change the volume are left out; that of a vessel is of its glass alone, so that only
     its outer wall, which comes from masks, says that it is the same object.
     """
     masks, *others = trials
+    most = max(_VOLUME_CHANGE, _volume_of_a_pixel(scene, mesh))
     complaints = {
-        trial.name: objection(mesh, trial.mesh, _VOLUME_CHANGE)
+        trial.name: objection(mesh, trial.mesh, most)
         for trial in others
         if not isinstance(trial.model, Vessel)
     }
@@ -162,6 +167,14 @@ def choose(mesh: Mesh, trials: Sequence[Trial]) -> tuple[Trial, Trial, str]:
     if complaint := complaints.get(best.name):
         return masks, masks, f"the {best.name} was rejected: {complaint}"
     return masks, masks, "no shape explains the judges significantly better"
+
+
+def _volume_of_a_pixel(scene: Path, mesh: Mesh) -> float:
+    """Returns the share of the volume that a layer as thick as a pixel has."""
+    cameras = scene_folder.read_frames(scene, "train").cameras
+    away = np.linalg.norm(cameras.poses[:, :, 3] - mesh.vertices.mean(axis=0), axis=-1).mean()
+    area = np.linalg.norm(face_vectors(mesh.vertices, mesh.faces), axis=-1).sum()
+    return float(area * away / cameras.focal / volume(mesh.vertices, mesh.faces))
 
 
 def _write_parts(
@@ -209,7 +222,7 @@ def fit(
       seed: random seed.
     """
     frames = scene_folder.read_frames(scene, "train")
-    outlines = Outlines(Views(scene_folder.read_masks(frames), frames.cameras), seed=seed)
+    views = Views(scene_folder.read_masks(frames), frames.cameras)
     outer = families.fit_revolution(mesh, furthest=_FURTHEST)
     options = {} if known.source == "estimated" else {"deviation": 0.0}
     with ProgressBar("light", 100) as bar:
@@ -219,7 +232,7 @@ def fit(
             surface,
             seen.fitted,
             seen.judges,
-            outlines=outlines,
+            outlines=Outlines(views, common=_WIDER, seed=seed),
             seed=seed,
             is_enough=lambda trials: _may_be_vessel(outer, trials),
             progress=lambda share, text: bar.show(round(100 * share), text),
@@ -227,6 +240,7 @@ def fit(
         )
     if not _may_be_vessel(outer, trials):
         return trials
+    outlines = Outlines(views, seed=seed)
     return (*trials, *_vessels(outer, known, surface, seen, outlines, seed=seed))
 
 

@@ -105,11 +105,13 @@ class Rows(NamedTuple):
       errors: errors, in units of their standard deviation.
       derivatives: their derivatives by the unknowns.
       weights: robust weight of each.
+      common: standard deviation of an error that all rows share, in the same units.
     """
 
     errors: Float[np.ndarray, " rows"]
     derivatives: Matrix
     weights: Float[np.ndarray, " rows"]
+    common: float = 0.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -328,11 +330,16 @@ def _further(
 
 
 def _with_rows(light: Equations, rows: Rows) -> Equations:
-    """Returns the equations with further ones."""
+    """Returns the equations with further ones, whose common error is eliminated."""
     weighted = scipy.sparse.diags_array(rows.weights) @ rows.derivatives
     matrix = rows.derivatives.T @ weighted
     dense = matrix.toarray() if scipy.sparse.issparse(matrix) else matrix
     gradient = weighted.T @ rows.errors
+    if rows.common:
+        together = weighted.T @ np.ones(len(rows.errors))
+        total = np.sum(rows.weights) + rows.common**-2.0
+        dense = dense - np.outer(together, together) / total
+        gradient = gradient - together * (rows.weights @ rows.errors) / total
     return light._replace(matrix=light.matrix + dense, gradient=light.gradient + gradient)
 
 

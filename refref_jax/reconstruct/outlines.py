@@ -47,14 +47,15 @@ class _Rim(NamedTuple):
 class Outlines:
     """The outlines of masks, as a function of a candidate to `Rows`."""
 
-    def __init__(self, views: Views, *, seed: int = 0) -> None:
+    def __init__(self, views: Views, *, common: float = 0.0, seed: int = 0) -> None:
         """Measures the signed distances of all masks.
 
         Args:
           views: masks and their cameras.
+          common: standard deviation, in pixels, of how much too wide all masks are.
           seed: seed of the draws of rim points.
         """
-        self._cameras, self._seed = views.cameras, seed
+        self._cameras, self._common, self._seed = views.cameras, common, seed
         self._distances = [
             signed_distances(mask).astype(np.float32) if mask.any() and not mask.all() else None
             for mask in views.masks
@@ -74,7 +75,7 @@ class Outlines:
         errors = np.concatenate([each[0] for each in found])
         derivatives = scipy.sparse.vstack([each[1] for each in found]).tocsr()
         weights = 1.0 / (1.0 + (errors * _DEVIATION / _WRONG) ** 2) ** 2
-        return Rows(errors, derivatives @ part.by_vertices, weights)
+        return Rows(errors, derivatives @ part.by_vertices, weights, self._common / _DEVIATION)
 
     def _of_view(
         self,

@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
+from scipy.ndimage import binary_dilation
 
 from refref_jax.optics.interface_rules import NO_PARENT, nested
+from refref_jax.reconstruct import gauss_newton
 from refref_jax.reconstruct import outlines as outlines_module
 from refref_jax.reconstruct.families import Sphere
-from refref_jax.reconstruct.gauss_newton import Candidate
+from refref_jax.reconstruct.gauss_newton import Candidate, Equations, Rows
 from refref_jax.reconstruct.masks import Views
 from refref_jax.reconstruct.outlines import Outlines
 from refref_jax.reconstruct.shape_from_refraction import SingleObject
@@ -77,6 +79,32 @@ def test_an_outline_without_unknowns_moves_nothing(outlines):
     rows = _rows(outlines, FixedShape(bodies.icosphere(3)))
     assert len(rows.errors) > 100 and rows.derivatives.shape == (len(rows.errors), 1)
     assert not rows.derivatives.toarray().any()
+
+
+def test_a_common_error_is_eliminated_as_an_unknown_of_its_own():
+    random = np.random.default_rng(3)
+    errors, slopes, weights = random.normal(size=9), random.normal(size=(9, 4)), np.full(9, 0.7)
+    nothing = Equations(np.eye(4), np.zeros(4), np.zeros((1, 4)), np.zeros((4, 4)))
+    found = gauss_newton._with_rows(nothing, Rows(errors, slopes, weights, 2.0))
+    wide = np.concatenate([slopes, np.ones((9, 1))], axis=1)
+    whole = wide.T @ (weights[:, None] * wide) + np.diag([1.0, 1.0, 1.0, 1.0, 0.25])
+    together = -np.linalg.solve(whole, wide.T @ (weights * errors))
+    alone = -np.linalg.solve(found.matrix, found.gradient)
+    np.testing.assert_allclose(alone, together[:4], rtol=1e-10)
+
+
+def test_masks_that_are_all_too_wide_leave_the_size_to_the_light():
+    cameras = bodies.cameras_around(8, size=120, distance=3.0)
+    masks = binary_dilation(bodies.masks_of(bodies.ball, cameras), np.ones((1, 3, 3), bool))
+    moved = []
+    for common in (0.0, 0.5):
+        rows = _rows(Outlines(Views(masks, cameras), common=common), Sphere(_ORIGIN, 1.0))
+        nothing = Equations(np.zeros((5, 5)), np.zeros(5), np.zeros((1, 5)), np.zeros((5, 5)))
+        found = gauss_newton._with_rows(nothing, rows)
+        # Light that knows the radius to a thousandth.
+        known = np.diag([1.0, 1.0, 1.0, 1e6, 1.0])
+        moved.append(-np.linalg.solve(found.matrix + known, found.gradient)[3])
+    assert moved[0] > 2e-3 and abs(moved[1]) < 0.02 * moved[0]
 
 
 def test_inner_parts_have_no_outline(outlines):
