@@ -357,7 +357,7 @@ def test_an_estimated_index_is_refined_with_the_surface(scene, whole, tmp_path, 
 
 def test_a_body_that_light_blew_up_is_left_out(scene, monkeypatch, tmp_path):
     mesh = bodies.icosphere(2)
-    _stub_light(monkeypatch, after=0.01, growth=1.05)
+    _stub_light(monkeypatch, after=0.01, growth=1.5)
     known, target = records.IndexFacts("estimated", 1.5, 0.01, 0.04), tmp_path / "a" / "b.ply"
     facts = light_stage.run(scene, mesh, known, "surface", target, seed=0)
     assert not facts.kept and not target.exists() and facts.index == 1.5
