@@ -25,6 +25,10 @@ _NORMALS = 4096
 # Standard errors by which a trial must be worse than the best to lose.
 _WORSE = 2.0
 
+# Differences below a quarter of an 8-bit level say nothing, sRGB: light that is not followed makes
+# as much.
+_LEVEL = 0.25 / 255.0
+
 
 @runtime_checkable
 class ObjectModel(Model, Protocol):
@@ -118,13 +122,15 @@ def compare(trial: Trial, best: Trial) -> Comparison:
 def choose(trials: Sequence[Trial]) -> Trial:
     """Returns the trial of fewest unknowns that is not worse than the best by two standard errors.
 
+    A difference of less than a quarter of an 8-bit level does not count.
+
     Args:
       trials: one or more trials.
     """
     best = min(trials, key=lambda trial: trial.error)
     for trial in sorted(trials, key=lambda trial: len(trial.fit.x)):
         worse = compare(trial, best)
-        if worse.mean <= _WORSE * worse.error:
+        if worse.mean <= max(_WORSE * worse.error, _LEVEL):
             return trial
     return best
 
