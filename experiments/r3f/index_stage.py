@@ -12,6 +12,7 @@ for the refinement by light.
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -218,8 +219,8 @@ def learn_background(
         started with another background.
       KeyboardInterrupt: if its training was stopped; it has been saved.
     """
-    background = {"space": space, "radius": radius, "centre": centre}
-    wanted = _resolved(scene, folder / BACKGROUND, seed=seed, steps=steps, **background)
+    given = {"background": space, "radius": radius, "centre": centre, "seed": seed}
+    wanted = _resolved(scene, folder / BACKGROUND, steps, **given)
     return _learned(scene, folder / BACKGROUND, wanted)
 
 
@@ -232,33 +233,21 @@ def learn_backdrop(
     radius: float | None = None,
     centre: Position | None = None,
 ) -> Backdrop | None:
-    """Returns the backdrop, as `learn_background`; `None`, without training, if it is a field."""
-    background = {"space": space, "radius": radius, "centre": centre}
-    wanted = _resolved(scene, folder / BACKGROUND, seed=seed, steps=STEPS, **background)
+    """Returns the backdrop, which is solved for first if necessary; `None` if it must be a field.
+
+    Arguments and errors are those of `learn_background`, but no field is trained.
+    """
+    given = {"background": space, "radius": radius, "centre": centre, "seed": seed}
+    wanted = _resolved(scene, folder / BACKGROUND, STEPS, **given)
     if wanted.model.config.backdrop is None:
         return None
     return backdrop_of(folder, _learned(scene, folder / BACKGROUND, wanted))
 
 
-def _resolved(
-    scene: Path,
-    run: Path,
-    *,
-    seed: int,
-    space: Space | None,
-    radius: float | None,
-    centre: Position | None,
-    steps: int,
-) -> Resolved:
-    """Returns how the background is to be learned."""
+def _resolved(scene: Path, run: Path, steps: int, **given: Any) -> Resolved:
+    """Returns how the background is to be learned, with the options that are given."""
     config = TrainConfig().override(
-        scene=str(scene.resolve()),
-        pixels="background",
-        background=space,
-        radius=radius,
-        centre=centre,
-        paths="straight",
-        seed=seed,
+        scene=str(scene.resolve()), pixels="background", paths="straight", **given
     )
     facts = read_facts(config.scene, parts=())
     wanted = resolve(config, facts)
