@@ -254,8 +254,9 @@ def fit(
         seen = photometry.blurred(surface, blur)
         candidate = model.pose(x)
         traced = traced_object(candidate)
-        scale = settings.widest * _NARROWING**number
-        light = linearise(candidate, traced, seen, draw(settings.rays), settings, scale)
+        wide = settings.widest * _NARROWING**number
+        drawn = draw(settings.rays)
+        light = linearise(candidate, traced, seen, drawn, settings, least_scale=wide)
         if outlines is not None:
             light = _with_rows(light, outlines(candidate))
         x, damping, fact = _step(
@@ -349,7 +350,8 @@ def linearise(
     surface: Backdrop,
     pixels: Photographs,
     settings: Steps,
-    scale: float = 0.0,
+    *,
+    least_scale: float = 0.0,
 ) -> Equations:
     """Returns the normal equations of some pixels.
 
@@ -359,7 +361,7 @@ def linearise(
       surface: backdrop.
       pixels: some pixels.
       settings: settings of the fit, of which the share of outliers counts.
-      scale: least scale of the robust weights, sRGB.
+      least_scale: least scale of the robust weights, sRGB.
     """
     predicted = photometry.predict(traced, surface, pixels.rays)
     found = photometry.sensitivities(traced, surface, pixels.rays, predicted)
@@ -368,7 +370,7 @@ def linearise(
     slopes = found.slopes * encode[:, None]
     coordinates = _by_unknowns(candidate, traced, found)
     usable = found.usable & (predicted.dropped < 1.0 - _FOLLOWED) & (found.coverage > _SEEN)
-    weights = _robust_weights(error, usable, max(scale, _LEAST_SCALE))
+    weights = _robust_weights(error, usable, max(least_scale, _LEAST_SCALE))
     weights = weights * _unsaturated(predicted.linear, pixels.rgb)
     jacobian = _block_diagonal(np.swapaxes(slopes, 1, 2)) @ coordinates
     if candidate.by_tints.shape[0]:

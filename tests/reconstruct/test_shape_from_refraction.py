@@ -389,7 +389,9 @@ def test_a_wide_scale_weighs_a_fault_that_few_pixels_see(world, glass, seen):
     candidate = glass.pose(glass.start())
     body = gauss_newton.traced_object(candidate)
     narrow, wide = (
-        gauss_newton.linearise(candidate, body, world, seen._replace(rgb=rgb), Steps(), scale)
+        gauss_newton.linearise(
+            candidate, body, world, seen._replace(rgb=rgb), Steps(), least_scale=scale
+        )
         for scale in (0.0, 0.5)
     )
     steps = [-each.gradient[-1] / each.matrix[-1, -1] for each in (narrow, wide)]
