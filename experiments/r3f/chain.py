@@ -43,13 +43,12 @@ def reconstruct(
         installed, if no object fits the masks, or if the folder contains anything else.
     """
     import_skimage()
-    masks = scene_folder.read_masks(scene_folder.read_frames(scene, "train"))
-    if config.outliers >= len(masks):
+    masks = len(scene_folder.read_masks(scene_folder.read_frames(scene, "train")))
+    if config.outliers >= masks:
         raise ValueError(
-            f"--outliers={config.outliers}, but there are {len(masks)} train masks. Use fewer."
+            f"--outliers={config.outliers}, but there are {masks} train masks. Use fewer."
         )
-    # Broken files are reported now, not after hours.
-    scene_folder.read_masks(report.judging_frames(scene)[1])
+    _read_held_out_masks(scene)
     asked = Reconstruction(scene_names.of_folder(scene), fingerprint(scene), config)
     found = records.begin(out, asked)
     with atomic_files.hold(out):
@@ -71,6 +70,15 @@ def reconstruct(
             records.write(out, found)
         say(_describe_report(found))
     return found
+
+
+def _read_held_out_masks(scene: Path) -> None:
+    """Reads masks that judge, so that broken files are reported now, not after hours."""
+    for split in ("val", "test"):
+        if (scene / f"transforms_{split}.json").is_file():
+            frames = scene_folder.read_frames(scene, split)
+            if frames.masks is not None:
+                scene_folder.read_masks(frames)
 
 
 def read_parts(out: Path) -> list[MeshPart]:

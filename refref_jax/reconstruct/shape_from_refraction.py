@@ -389,7 +389,7 @@ def _fit_free(
 def _has_creases(mesh: Mesh) -> bool:
     """Returns whether vertices have several normals; smoothing would round these edges."""
     groups = smooth_groups(mesh.vertices, mesh.faces)
-    return groups.max() + 1 > (1.0 + _CREASED) * len(np.unique(mesh.faces))
+    return bool(groups.max() + 1 > (1.0 + _CREASED) * len(np.unique(mesh.faces)))
 
 
 def _with_many_vertices(mesh: Mesh) -> Mesh:

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.sparse
+import trimesh
 
 from refref_jax.geometry.cameras import image_rays
 from refref_jax.geometry.rays import Rays
@@ -463,6 +464,19 @@ def test_tints_are_found_with_the_index(world, seen, ball):
     )
     np.testing.assert_allclose(np.exp(found.x[-3:]), tint, atol=5e-3)
     assert true.index_of(found.x) == pytest.approx(_INDEX, abs=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("mesh", "creased"),
+    [
+        (trimesh.creation.box(), True),
+        (trimesh.creation.cylinder(0.5, 1.0, sections=64), True),
+        (trimesh.creation.icosphere(subdivisions=3), False),
+        (trimesh.creation.torus(1.0, 0.3), False),
+    ],
+)
+def test_creases_are_told_from_smooth_surfaces(mesh, creased):
+    assert shape_from_refraction._has_creases(bodies.as_mesh(mesh)) == creased
 
 
 def test_no_pixels_are_refused_with_advice(world, glass, ball, seen):

@@ -3,6 +3,7 @@
 import json
 import shutil
 
+import imageio.v3 as iio
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -69,6 +70,16 @@ def test_the_scene_alone_chooses_the_backdrop(scene, tmp_path):
         other, _ = prepare(asked.override(**{name: value}), report=lines.append)
         assert other.config.model.far_field == "field", name
         assert "preset=tiny" in other.describe()
+
+
+def test_images_without_a_pixel_of_background_are_refused(scene, tmp_path):
+    copy = shutil.copytree(scene, tmp_path / "scene")
+    for path in scene_folder.read_frames(copy, "train").masks:
+        mask = iio.imread(path)
+        iio.imwrite(path, np.full_like(mask, 255))
+    config = _config(copy).override(pixels="background")
+    with pytest.raises(ValueError, match="lies outside the masks"):
+        fit(config, out=tmp_path / "run")
 
 
 def test_a_wrong_size_of_the_background_leads_to_a_field_or_is_told(scene):

@@ -222,6 +222,23 @@ def test_what_is_missing_is_told_before_anything_is_written(scene, tmp_path, mon
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("split", ["val", "test"])
+def test_broken_masks_of_held_out_views_are_named_before_anything_is_written(
+    scene, tmp_path, split
+):
+    copy = shutil.copytree(scene, tmp_path / "broken")
+    for other in ("val", "test"):
+        shutil.copy(copy / "transforms_train.json", copy / f"transforms_{other}.json")
+    content = json.loads((copy / f"transforms_{split}.json").read_text())
+    mask = copy / "mask" / "no image.png"
+    mask.write_bytes(b"no image")
+    content["frames"][-1]["mask_file_path"] = str(mask.relative_to(copy))
+    (copy / f"transforms_{split}.json").write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"no image\.png"):
+        _run(copy, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize(
     ("compare", "remark"), [(False, "were not read"), (True, "could not be read")]
 )
