@@ -1,11 +1,11 @@
-"""Cross-sections of objects and light paths in a horizontal plane through the origin.
+"""Cross-sections of objects, and light paths in a horizontal plane through the origin.
 
 A ray in the plane z = 0 stays there around an object that is symmetric about the plane, such as a
 ball, so its drawing is exact. For other objects a drawing is a projection of the paths from above.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
@@ -58,7 +58,10 @@ def outlines_of(parts: Sequence[MeshPart]) -> list[Outline]:
     Raises:
       SceneError: if the plane intersects no part.
     """
-    found = [outline for part in parts for outline in _outlines(part.vertices, part.faces)]
+    plane: dict[str, Any] = {"origin": (0.0, 0.0, _HEIGHT), "axes": ((1, 0, 0), (0, 1, 0))}
+    found = [
+        outline for part in parts for outline in outlines_in(part.vertices, part.faces, **plane)
+    ]
     if not found:
         raise SceneError(
             "No mesh reaches the horizontal plane through the origin, which is drawn. Move the "
@@ -104,12 +107,27 @@ def _cut(points: Outline, half: float) -> Outline:
     return np.concatenate([points[:-1], (start + max(ways.min(), 0.0) * step)[None]])
 
 
-def _outlines(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -> list[Outline]:
+def outlines_in(
+    vertices: Float[np.ndarray, "n 3"],
+    faces: Int[np.ndarray, "m 3"],
+    *,
+    origin: Sequence[float],
+    axes: Sequence[Sequence[float]],
+) -> list[Outline]:
+    """Returns the outlines of a mesh in a plane.
+
+    Args:
+      vertices: vertices.
+      faces: triangles.
+      origin: a point of the plane, from which outlines are measured, world units.
+      axes: two directions in the plane, orthogonal and of length 1.
+    """
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     segments = trimesh.intersections.mesh_plane(
-        mesh, plane_normal=(0.0, 0.0, 1.0), plane_origin=(0.0, 0.0, _HEIGHT)
+        mesh, plane_normal=np.cross(*axes), plane_origin=origin
     )
-    ends = np.round(np.asarray(segments, float).reshape(-1, 3)[:, :2], _DECIMALS)
+    within = (np.asarray(segments, float).reshape(-1, 3) - origin) @ np.transpose(axes)
+    ends = np.round(within, _DECIMALS)
     nodes, places = np.unique(ends, axis=0, return_inverse=True)
     near: list[list[int]] = [[] for _ in nodes]
     for first, second in places.reshape(-1, 2).tolist():

@@ -12,11 +12,13 @@ import numpy as np
 from jaxtyping import Float
 
 from experiments.cli import app
+from experiments.figures import cut_open
 from experiments.r3f import object_source, report_figures
 from experiments.r3f.records import DistanceFacts, IndexFacts, Reconstruction, ReportFacts
 from experiments.r3f.report_figures import Outline, SurfaceView, Window
 from refref_jax import atomic_files
 from refref_jax.data import SceneError, mesh_queries, meshes, scene_folder
+from refref_jax.data.meshes import MeshPart
 from refref_jax.data.scene_assembly import shaded_mesh
 from refref_jax.data.scene_folder import Frames
 from refref_jax.geometry.cameras import Cameras, image_rays
@@ -30,6 +32,7 @@ from refref_jax.render.images import FirstSurface, find_first_surface
 
 FOLDER = "pictures"
 FILE = "report.md"
+_INSIDE = "inside.png"
 
 _ROWS = 3
 
@@ -51,10 +54,11 @@ JUDGES = {"val": "validation views", "train": "training views that were not fitt
 
 
 class _Truth(NamedTuple):
-    """The scene's own outermost surface, or the reason why it is missing."""
+    """The scene's own parts and their outermost surface, or the reason why these are missing."""
 
     mesh: Mesh | None
     remark: str
+    parts: tuple[MeshPart, ...] = ()
 
 
 def run(scene: Path, out: Path, found: Reconstruction, compare: bool) -> ReportFacts:
@@ -77,7 +81,10 @@ def run(scene: Path, out: Path, found: Reconstruction, compare: bool) -> ReportF
         truth=truth.mesh and DistanceFacts(*compare_meshes(mesh, truth.mesh)),
         remark=truth.remark,
     )
+    parts = object_source.read_parts(out, found)
     with atomic_files.written_folder(out / FOLDER) as folder:
+        if len(parts) > 1:
+            cut_open.write(folder / _INSIDE, parts, truth.parts)
         report_figures.draw_overlaps(folder / "overlap.png", outlines)
         report_figures.draw_errors(folder / "iou.png", outlines)
         report_figures.draw_surface(
@@ -130,7 +137,7 @@ def _read_truth(scene: Path) -> _Truth:
     names = ", ".join(f"{part.name}.ply" for part in outer)
     inner = len(parts) - len(outer)
     within = f"; {inner} more within {'it' if len(outer) == 1 else 'them'}" if inner else ""
-    return _Truth(joined, f"Compared with {names}{within}.")
+    return _Truth(joined, f"Compared with {names}{within}.", tuple(parts))
 
 
 def _surface_views(mesh: Mesh, truth: Mesh | None, frames: Frames) -> list[SurfaceView]:
@@ -213,6 +220,7 @@ def markdown(out: Path, found: Reconstruction, facts: ReportFacts) -> str:
         "![Errors of the silhouettes](pictures/iou.png)",
         f"## Surface\n\n{_of_truth(facts)}",
         "![Normals, and the distance to the true surface](pictures/surface.png)",
+        *_inside(found),
         *_pictures_of_index(out),
         *_of_light(found),
         "## Options\n\n" + _making(found),
@@ -311,6 +319,17 @@ def _of_light(found: Reconstruction) -> list[str]:
         "\n".join(lines),
         chosen,
         "![Pixels before and after, and the uncertainty of the normals](light/errors.png)",
+    ]
+
+
+def _inside(found: Reconstruction) -> list[str]:
+    """Returns the section on what is inside the object, if something is."""
+    if found.light is None or len(found.light.parts) < 2:
+        return []
+    return [
+        f"## Inside\n\nThe object is a {found.light.shape}. Its nearer half is removed. Cut glass "
+        "is grey; where there is air its walls are seen.",
+        f"![The object, cut open]({FOLDER}/{_INSIDE})",
     ]
 
 
