@@ -1,19 +1,20 @@
 """Claim: light refines shape and index until they are nearly as good as the true ones.
 
-    python -m benchmarks.r3f_by_light --scenes=FOLDER,FOLDER [--limit=N] [--field_steps=N]
+    python -m benchmarks.r3f_by_light --scenes=FOLDER,FOLDER [--limit=N] [--field_steps=N] \
+        [--straight_steps=N]
 
 Each scene is reconstructed from its images and masks as `experiments.reconstruct` does. The first
 table has, for the surface from masks, for every shape that light fitted and for the scene's own
 mesh, the mean error of pixels that were not fitted, the index of refraction, and the angle between
 its normals and the true ones. The second has the results of training with the reconstruction, and
 with the scene's own meshes: masked PSNR on the test split, with a backdrop and, with
-`--field_steps`, with a field, and along straight rays. Finished reconstructions and trainings are
-reused.
+`--field_steps`, with a field. With `--straight_steps` a field is trained along straight rays, too.
+Finished reconstructions and trainings are reused.
 
 Of a vessel with liquid the level, both indices and the tint are printed, too.
 
 Asserted are the bounds of `_MUST` for the scenes named there, for all others that light is no worse
-than masks, and with `--field_steps` that light is 3 dB better than straight rays.
+than masks, and with `--straight_steps` that light is 3 dB better than straight rays.
 """
 
 import dataclasses
@@ -36,6 +37,9 @@ _SCENES = flags.DEFINE_list("scenes", ["experiments/data/cube_smcvx_ball"], "Fol
 _LIMIT = flags.DEFINE_integer("limit", 8, "Number of test images, evenly spaced.", 1)
 _RAYS_PER_PIXEL = flags.DEFINE_integer("rays_per_pixel", 4, "Rays per pixel in evaluation.", 1)
 _FIELD_STEPS = flags.DEFINE_integer("field_steps", 0, "Steps of a field; 0 trains none.", 0)
+_STRAIGHT_STEPS = flags.DEFINE_integer(
+    "straight_steps", 0, "Steps of a field along straight rays; 0 trains none.", 0
+)
 _OUT = flags.DEFINE_string("out", "runs/r3f_by_light", "Output folder.")
 
 
@@ -196,18 +200,18 @@ def _train_all(scene: Path) -> list[str]:
         "true": [],
     }
     worlds = {"backdrop": ["--far_field=backdrop"]}
-    wrong, straight = [], -np.inf
     if _FIELD_STEPS.value:
-        field = ["--far_field=field", "--preset=tiny", f"--steps={_FIELD_STEPS.value}"]
-        worlds["field"] = field
-        straight = _masked(scene, "field_straight", [*field, "--paths=straight"])
+        worlds["field"] = _field(_FIELD_STEPS.value)
+    wrong, straight = [], -np.inf
+    if steps := _STRAIGHT_STEPS.value:
+        straight = _masked(scene, "straight", [*_field(steps), "--paths=straight"])
     for world, more in worlds.items():
         found = {
             kind: _masked(scene, f"{world}_{kind}", [*given, *more, "--paths=tree"])
             for kind, given in objects.items()
         }
         cells = " | ".join(f"{psnr:.2f}" for psnr in found.values())
-        last = f"{straight:.2f}" if _FIELD_STEPS.value else ""
+        last = f"{straight:.2f}" if _STRAIGHT_STEPS.value else ""
         print(f"| {name} | {world} | {cells} | {last} |", flush=True)
         if world == "backdrop" and found["light"] < straight + _GAIN:
             wrong.append(f"{name}: {found['light']:.2f} dB masked, straight rays {straight:.2f}")
@@ -215,6 +219,11 @@ def _train_all(scene: Path) -> list[str]:
         if world == "backdrop" and must and must.psnr and found["light"] < must.psnr:
             wrong.append(f"{name}: {found['light']:.2f} dB masked, {must.psnr} wanted")
     return wrong
+
+
+def _field(steps: int) -> list[str]:
+    """Returns the options of a field."""
+    return ["--far_field=field", "--preset=tiny", f"--steps={steps}"]
 
 
 def _masked(scene: Path, name: str, options: Sequence[str]) -> float:

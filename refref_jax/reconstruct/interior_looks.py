@@ -7,8 +7,9 @@ and the level; other gaps, liquids and an open mouth are tried for the best of t
 Source: ours.
 """
 
+import contextlib
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -177,6 +178,17 @@ def _best_tint(
     return _LOG_TINTS[np.argmin(np.stack(errors), axis=0)]
 
 
+def looks_at(
+    interiors: Sequence[Interior], outer: Revolution, surface: Backdrop, pixels: Photographs
+) -> list[Look]:
+    """Returns looks at the hypotheses that fit into an outer surface."""
+    found = []
+    for interior in interiors:
+        with contextlib.suppress(ReconstructionError):
+            found.append(look(outer, interior, surface, pixels))
+    return found
+
+
 def looks_at_all(
     outer: Revolution, surface: Backdrop, pixels: Photographs, settings: SearchSettings
 ) -> list[Look]:
@@ -191,23 +203,15 @@ def looks_at_all(
     some = pixels.drawn(generator, settings.pixels)
     blurred = photometry.blurred(surface, settings.blur)
 
-    def tried(interiors: Iterator[Interior] | Sequence[Interior]) -> list[Look]:
-        found = []
-        for interior in interiors:
-            try:
-                found.append(look(outer, interior, blurred, some))
-            except ReconstructionError:
-                continue
-        return found
-
-    looks = tried(hypotheses(outer, settings=settings))
+    looks = looks_at(hypotheses(outer, settings=settings), outer, blurred, some)
     if not looks:
         raise ReconstructionError(
             "No wall leaves space inside the object. Pass smaller `thicknesses`."
         )
     for variants in (_other_gaps, _other_indices, _other_mouths):
         best = _best_looks(looks, settings)
-        looks += tried(other for each in best for other in variants(each.interior, outer, settings))
+        others = [other for each in best for other in variants(each.interior, outer, settings)]
+        looks += looks_at(others, outer, blurred, some)
     return sorted(looks, key=lambda each: each.error)
 
 

@@ -13,6 +13,7 @@ Source: ours.
 """
 
 import dataclasses
+import operator
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -29,7 +30,7 @@ from refref_jax.reconstruct.interior_looks import (
     SearchSettings,
     extent,
     finalists,
-    look,
+    looks_at,
     looks_at_all,
 )
 from refref_jax.reconstruct.interiors import Vessel
@@ -39,8 +40,9 @@ from refref_jax.reconstruct.photometry import Backdrop, Photographs
 # Share of the pixels of largest derivatives that a step leaves out: interiors have many surfaces.
 _OUTLIERS = 0.02
 
-# Gaps tried once the level is known, as shares of the diameter, and the blur of these looks.
-_GAPS, _GAP_BLUR = (0.001, 0.004, 0.01, 0.02, 0.03, 0.045, 0.06, 0.08, 0.1), 2
+# Levels and gaps that are looked at again, as shares of the height, and the blur of these looks.
+_SHIFTS = (0.0, 0.03, -0.03, 0.05, -0.05, 0.08, -0.08, 0.12, -0.12)
+_GAPS, _BLUR = (0.001, 0.004, 0.01, 0.02, 0.03, 0.045, 0.06, 0.08, 0.1), 2
 
 
 class Finding(NamedTuple):
@@ -169,8 +171,8 @@ def search(
     for found in finalists(looks, settings):
         rough.append(_few_fitted(outer, found.interior, surface, pixels, judges, settings))
         say(f"{rough[-1].name}: looked {found.error:.4f}, error {rough[-1].error:.4f}")
-    for each in _best_of_kinds(rough, settings):
-        interior = _with_gap(outer, each, surface, pixels, settings)
+    rivals = _best_of_kinds(rough, settings)
+    for interior in _looked_again(outer, rivals, surface, pixels, settings):
         vessel = Vessel(outer, interior, detail)
         start, steps = vessel.start(), settings.all
         fitted = _fitted(vessel, start, surface, pixels, judges, settings, steps, outlines)
@@ -247,30 +249,57 @@ def _with_wall(finding: Finding) -> Interior:
     return dataclasses.replace(interior, wall=max(wall, 0.5 * interior.wall))
 
 
-def _with_gap(
+def _looked_again(
     outer: Revolution,
-    finding: Finding,
+    findings: Sequence[Finding],
     surface: Backdrop,
     pixels: Photographs,
     settings: SearchSettings,
-) -> Interior:
-    """Returns the interior of a finding with the gap that suits it best.
+) -> list[Interior]:
+    """Returns the interiors of findings, with the level and the gap that suit them best.
 
-    A thin gap does not show which way it should grow, so several are looked at, upwards from the
-    level and downwards from the air.
+    Steps move a level by little, and never open a mouth. So levels around that of a finding are
+    looked at, with each mouth, which only the fit of all unknowns can tell apart.
     """
-    at, size = _with_wall(finding), extent(outer)[0]
-    if not at.level_unknown:
-        return at
-    generator = np.random.default_rng(settings.seed + 1)
-    some = pixels.drawn(generator, settings.pixels)
-    blurred = photometry.blurred(surface, _GAP_BLUR)
-    found = [look(outer, at, blurred, some)]
-    for gap in _GAPS:
-        for shift in (0.0, at.gap - gap * size):
-            other = dataclasses.replace(at, gap=gap * size, level=at.level + shift)
-            found.append(look(outer, other, blurred, some))
-    return min(found, key=lambda each: each.error).interior
+    some = pixels.drawn(np.random.default_rng(settings.seed + 1), settings.pixels)
+    blurred, size = photometry.blurred(surface, _BLUR), extent(outer)[0]
+    kept: dict[str, Look] = {}
+    for finding in findings:
+        at = _with_wall(finding)
+        if not at.level_unknown:
+            kept.setdefault(at.name, Look(at, finding.error))
+            continue
+        for mouth in sorted({at.mouth, *settings.mouths}):
+            looks = looks_at(
+                _other_levels(dataclasses.replace(at, mouth=mouth), size), outer, blurred, some
+            )
+            if not looks:  # there is no mouth at its top
+                continue
+            again = _gaps_of(min(looks, key=_error).interior, size)
+            best = min(looks_at(again, outer, blurred, some), key=_error)
+            kept[best.interior.name] = min(kept.get(best.interior.name, best), best, key=_error)
+    return [each.interior for each in kept.values()]
+
+
+_error = operator.attrgetter("error")
+
+
+def _other_levels(at: Interior, size: float) -> list[Interior]:
+    """Returns the same with levels around its own."""
+    return [dataclasses.replace(at, level=at.level + shift * size) for shift in _SHIFTS]
+
+
+def _gaps_of(at: Interior, size: float) -> list[Interior]:
+    """Returns the same with other gaps.
+
+    A thin gap does not show which way it should grow, so they begin at the level or end at the air.
+    """
+    others = [
+        dataclasses.replace(at, gap=gap * size, level=at.level + shift)
+        for gap in _GAPS
+        for shift in (0.0, at.gap - gap * size)
+    ]
+    return [at, *others]
 
 
 def _best_of_kinds(findings: Sequence[Finding], settings: SearchSettings) -> list[Finding]:
