@@ -13,7 +13,7 @@ from refref_jax.reconstruct import ReconstructionError, gauss_newton, interior_l
 from refref_jax.reconstruct.contents import Detail, Interior
 from refref_jax.reconstruct.families import Revolution, fit_revolution
 from refref_jax.reconstruct.interior_looks import SearchSettings, hypotheses, look
-from refref_jax.reconstruct.interior_search import Few, _finding, _simplest
+from refref_jax.reconstruct.interior_search import Few, _finding, _looked_again, _simplest
 from refref_jax.reconstruct.interiors import Vessel
 from refref_jax.reconstruct.mesh_distance import signed_distance
 from refref_jax.reconstruct.photometry import Backdrop, Photographs
@@ -213,6 +213,22 @@ def test_the_simplest_of_equally_good_findings_is_kept(body, surface, photograph
     simple, stained = finding(_FLASK), finding(dataclasses.replace(_FLASK, stained=True))
     wrong = finding(Interior("liquid", wall=0.12))
     assert _simplest([wrong, simple, stained]) is simple
+
+
+def test_levels_are_looked_at_again_with_both_mouths(body, surface, photographs):
+    off = dataclasses.replace(_FLASK, level=_FLASK.level + 0.16, gap=0.02)
+    vessel = Vessel(body, off, _SMALL)
+    x = vessel.start()
+    fit = gauss_newton.Fit(x, np.eye(len(x)), ())
+    far = _finding(vessel, fit, surface, photographs)
+    settings = SearchSettings(pixels=600)
+    closed, opened = _looked_again(body, [far], surface, photographs, settings)
+    assert (closed.mouth, opened.mouth) == (False, True)
+    assert closed.level == pytest.approx(_FLASK.level, abs=0.05)
+    assert abs(closed.gap - _FLASK.gap) < abs(off.gap - _FLASK.gap)
+    never = dataclasses.replace(settings, mouths=(False,))
+    (closed,) = _looked_again(body, [far], surface, photographs, never)
+    assert not closed.mouth
 
 
 def test_looks_leave_out_walls_that_fill_the_vessel(body, surface, photographs):
