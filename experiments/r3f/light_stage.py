@@ -187,7 +187,8 @@ def _write_parts(
         file = f"{name}_{solid.name}_{material}.ply"
         meshes.write_mesh(folder / file, *solid.mesh)
         given = known.source == "given" and solid.name == "glass"
-        facts.append(PartFacts(file, known.index if given else solid.index, solid.tint))
+        index = known.index if given else solid.index
+        facts.append(PartFacts(file, index, solid.tint, solid.absorption))
     return tuple(facts)
 
 

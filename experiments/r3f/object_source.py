@@ -83,7 +83,7 @@ def _read(folder: Path, facts: PartFacts) -> MeshPart:
     part = meshes.read_part(folder / facts.mesh, index=facts.index)
     if facts.tint is None:
         return part
-    return part._replace(tint=facts.tint, colour_known=True)
+    return part._replace(tint=facts.tint, absorption=facts.absorption, colour_known=True)
 
 
 def read_mesh(out: Path, found: Reconstruction) -> Mesh:

@@ -138,11 +138,13 @@ class PartFacts:
       mesh: name of its file in the folder `light`.
       index: index of refraction inside.
       tint: factor of linear RGB light at every crossing of its surface; `None` if unknown.
+      absorption: absorption inside, linear RGB, per world unit.
     """
 
     mesh: str
     index: float
     tint: tuple[float, float, float] | None = None
+    absorption: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 @dataclasses.dataclass(frozen=True)

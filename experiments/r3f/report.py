@@ -14,7 +14,13 @@ from jaxtyping import Float
 from experiments.cli import app
 from experiments.figures import cut_open
 from experiments.r3f import object_source, report_figures
-from experiments.r3f.records import DistanceFacts, IndexFacts, Reconstruction, ReportFacts
+from experiments.r3f.records import (
+    DistanceFacts,
+    IndexFacts,
+    PartFacts,
+    Reconstruction,
+    ReportFacts,
+)
 from experiments.r3f.report_figures import Outline, SurfaceView, Window
 from refref_jax import atomic_files
 from refref_jax.data import SceneError, mesh_queries, meshes, scene_folder
@@ -254,8 +260,7 @@ def _table(out: Path, found: Reconstruction, facts: ReportFacts) -> str:
         ),
     ]
     for part in found.light.parts[1:] if found.light is not None else ():
-        tint = "" if part.tint is None else f", tint {' '.join(f'{x:.3f}' for x in part.tint)}"
-        rows.append((f"inside: [{part.mesh}](light/{part.mesh})", f"index {part.index:.4f}{tint}"))
+        rows.append((f"inside: [{part.mesh}](light/{part.mesh})", _of_inside(part)))
     if found.light is not None and found.light.before is not None:
         light = found.light
         after = f"{light.after:.4f} as a {light.shape}" if light.kept else "not refined"
@@ -273,6 +278,15 @@ def _table(out: Path, found: Reconstruction, facts: ReportFacts) -> str:
             ),
         ]
     return "\n".join(["| | |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows)])
+
+
+def _of_inside(part: PartFacts) -> str:
+    def numbers(colour: tuple[float, ...]) -> str:
+        return " ".join(f"{channel:.3f}" for channel in colour)
+
+    tint = "" if part.tint is None else f", tint {numbers(part.tint)}"
+    absorbs = f", absorption {numbers(part.absorption)} per unit" * any(part.absorption)
+    return f"index {part.index:.4f}{tint}{absorbs}"
 
 
 def _of_truth(facts: ReportFacts) -> str:

@@ -47,7 +47,8 @@ class Interior:
       glass: index of refraction of the glass.
       liquid: the same of the liquid.
       tint: factor on light at each crossing of the liquid's surface, linear RGB.
-      glass_tint: the same of the glass.
+      absorption: absorption of the liquid, linear RGB, per world unit.
+      glass_tint: the same as `tint` of the glass.
       stained: whether the tint of the glass is unknown.
     """
 
@@ -59,6 +60,7 @@ class Interior:
     glass: float = 1.5
     liquid: float = 1.36
     tint: Colour = (1.0, 1.0, 1.0)
+    absorption: Colour = (0.0, 0.0, 0.0)
     glass_tint: Colour = (1.0, 1.0, 1.0)
     stained: bool = False
 
@@ -95,7 +97,8 @@ class Layout:
         self.level, self.gap = take(interior.level_unknown), take(interior.level_unknown)
         self.profile = at - 4
         self.glass, self.liquid = take(1), take(interior.filled)
-        self.tint, self.glass_tint = take(3 * interior.filled), take(3 * interior.stained)
+        self.tint, self.absorption = take(3 * interior.filled), take(3 * interior.filled)
+        self.glass_tint = take(3 * interior.stained)
         self.count = at
 
     def names(self) -> list[str]:

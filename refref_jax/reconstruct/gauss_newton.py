@@ -31,7 +31,7 @@ from typing import Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
 import numpy as np
 import scipy.linalg
 import scipy.sparse
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Num
 
 from refref_jax.geometry.bvh import NO_PRIMITIVE
 from refref_jax.optics.media import Interfaces
@@ -71,12 +71,14 @@ class Candidate(NamedTuple):
       interfaces: interfaces of the parts, under the rule `nested`.
       by_indices: derivatives of the index of each part.
       by_tints: derivatives of the logarithm of the tint of each part and channel.
+      by_absorptions: derivatives of the absorption of each part's medium and channel.
     """
 
     parts: Sequence[Posed]
     interfaces: Interfaces
     by_indices: Matrix
     by_tints: Matrix
+    by_absorptions: Matrix | None = None
 
 
 @runtime_checkable
@@ -333,8 +335,7 @@ def _further(
 def _with_rows(light: Equations, rows: Rows) -> Equations:
     """Returns the equations with further ones, whose common error is eliminated."""
     weighted = scipy.sparse.diags_array(rows.weights) @ rows.derivatives
-    matrix = rows.derivatives.T @ weighted
-    dense = matrix.toarray() if scipy.sparse.issparse(matrix) else matrix
+    dense = _dense(rows.derivatives.T @ weighted)
     gradient = weighted.T @ rows.errors
     if rows.common:
         together = weighted.T @ np.ones(len(rows.errors))
@@ -373,23 +374,28 @@ def linearise(
     weights = _robust_weights(error, usable, max(least_scale, _LEAST_SCALE))
     weights = weights * _unsaturated(predicted.linear, pixels.rgb)
     jacobian = _block_diagonal(np.swapaxes(slopes, 1, 2)) @ coordinates
+    light = found.light * encode
     if candidate.by_tints.shape[0]:
-        jacobian = jacobian + _by_tints(candidate, found.light * encode, found.crossings)
+        jacobian = jacobian + _by_channels(light, found.crossings) @ candidate.by_tints
+    if candidate.by_absorptions is not None:
+        jacobian = jacobian - _by_channels(light, found.lengths) @ candidate.by_absorptions
     weights *= _without_largest(jacobian, weights, settings.outliers)[:, None]
     flat = weights.reshape(-1)
     weighted = scipy.sparse.diags_array(flat) @ jacobian
     squared = float(np.sum(flat * error.reshape(-1) ** 2) / max(np.sum(flat), 1.0))
-    matrix = jacobian.T @ weighted
-    dense = matrix.toarray() if scipy.sparse.issparse(matrix) else matrix
+    matrix = _dense(jacobian.T @ weighted)
     scale = max(squared, _LEAST_NOISE**2)
     names, views = np.unique(pixels.views, return_inverse=True)
     each = scipy.sparse.csr_array(
         (error.reshape(-1) / scale, (np.repeat(views, 3), np.arange(error.size))),
         shape=(len(names), error.size),
     )
-    by_view = each @ weighted
-    by_view = by_view.toarray() if scipy.sparse.issparse(by_view) else by_view
-    return Equations(dense / scale, by_view.sum(axis=0), by_view, dense / scale)
+    by_view = _dense(each @ weighted)
+    return Equations(matrix / scale, by_view.sum(axis=0), by_view, matrix / scale)
+
+
+def _dense(matrix: Any) -> Float[np.ndarray, "_ _"]:
+    return matrix.toarray() if scipy.sparse.issparse(matrix) else matrix
 
 
 def _covariance(
@@ -456,15 +462,13 @@ def _block_diagonal(blocks: Float[np.ndarray, "rays 3 3"]) -> scipy.sparse.csr_a
     return scipy.sparse.bsr_array(data, shape=(3 * count, 3 * count)).tocsr()
 
 
-def _by_tints(
-    candidate: Candidate,
-    light: Float[np.ndarray, "rays 3"],
-    crossings: Int[np.ndarray, "rays parts"],
-) -> Matrix:
-    """Returns the derivatives of the pixels by the logarithms of the tints."""
-    rows, parts = crossings.shape
-    blocks = crossings[:, None, :, None] * light[:, :, None, None] * np.eye(3)[None, :, None, :]
-    return blocks.reshape(3 * rows, 3 * parts) @ candidate.by_tints
+def _by_channels(
+    light: Float[np.ndarray, "rays 3"], counts: Num[np.ndarray, "rays parts"]
+) -> Float[np.ndarray, "values numbers"]:
+    """Returns derivatives by numbers of each part and channel, such as the logarithms of tints."""
+    rows, parts = counts.shape
+    blocks = counts[:, None, :, None] * light[:, :, None, None] * np.eye(3)[None, :, None, :]
+    return blocks.reshape(3 * rows, 3 * parts)
 
 
 def _robust_weights(

@@ -123,7 +123,13 @@ class Few:
             for part in found.parts
         )
         few = scipy.sparse.csr_array(self.directions)
-        return Candidate(parts, found.interfaces, found.by_indices @ few, found.by_tints @ few)
+        absorptions = found.by_absorptions
+        return found._replace(
+            parts=parts,
+            by_indices=found.by_indices @ few,
+            by_tints=found.by_tints @ few,
+            by_absorptions=None if absorptions is None else absorptions @ few,
+        )
 
     def prior(self, x: Float[np.ndarray, " few"]) -> tuple[Matrix, Float[np.ndarray, " few"]]:
         """Returns the prior of the model."""

@@ -15,6 +15,8 @@ Single-View Transmission Imaging (2017), for outer and inner profiles from refra
 """
 
 import dataclasses
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import scipy.sparse
@@ -42,12 +44,14 @@ _OFFSET, _BEND = 0.008, 0.004
 _INNER_OFFSET, _INNER_BEND = 0.03, 0.012
 _LEVEL, _GAP = 0.12, 0.04
 
-# The same of the indices of glass and liquid, and of the logarithm of a tint.
-_GLASS, _LIQUID, _TINT = 0.03, 0.1, 1.0
+# The same of the indices of glass and liquid, of the logarithm of a tint, and of absorption along
+# the diameter.
+_GLASS, _LIQUID, _TINT, _ABSORPTION = 0.03, 0.1, 1.0, 5.0
 
-# Largest changes in a step: of level and gap, as a share of the diameter, of an index, and of the
-# logarithm of a tint. The inner wall, which no mask shows, moves further than the outer one.
-_LEVEL_STEP, _INDEX_STEP, _TINT_STEP = 0.015, 0.02, 0.3
+# Largest changes in a step: of level and gap, as a share of the diameter, of an index, of the
+# logarithm of a tint, and of absorption along the diameter. The inner wall, which no mask shows,
+# moves further than the outer one.
+_LEVEL_STEP, _INDEX_STEP, _TINT_STEP, _ABSORPTION_STEP = 0.015, 0.02, 0.3, 1.0
 _INNER_STEPS = 2.0
 
 # Least thickness of a wall and of its gap, as a share of the diameter, and of the wall at rest.
@@ -65,6 +69,9 @@ _PARTS = 3
 # Fewest points of a piece of the inner wall.
 _FEWEST = 20
 
+# Absorption of a clear medium.
+_CLEAR: Colour = (0.0, 0.0, 0.0)
+
 # A mouth begins where the inner wall has turned this far from the horizontal.
 _UPRIGHT = 0.8
 
@@ -79,6 +86,7 @@ class Solid:
       index: index of refraction inside.
       parent: part that contains it, or `NO_PARENT`.
       tint: factor on light at each crossing of its surface, linear RGB.
+      absorption: absorption inside, linear RGB, per world unit.
     """
 
     name: str
@@ -86,14 +94,16 @@ class Solid:
     index: float
     parent: int
     tint: Colour
+    absorption: Colour = _CLEAR
 
 
 class Vessel:
     """A vessel as a `gauss_newton.Model`.
 
     The unknowns (`layout`) are the tilt and the shift of the axis, offsets of the outer and of the
-    inner wall along their normals at rest, the level, the gap, the indices of glass and liquid, and
-    the logarithms of the tints. The connectivity does not depend on them.
+    inner wall along their normals at rest, the level, the gap, the indices of glass and liquid, the
+    logarithms of the tints, and the absorption of the liquid. The connectivity does not depend on
+    them.
 
     Example:
       >>> vessel = Vessel(fit_revolution(mesh), Interior("liquid and air", wall=0.1, level=-0.2))
@@ -200,6 +210,8 @@ class Vessel:
         for where, tint in ((layout.tint, interior.tint), (layout.glass_tint, interior.glass_tint)):
             if where.stop > where.start:
                 x[where] = np.log(tint)
+        if interior.filled:
+            x[layout.absorption] = interior.absorption
         return x
 
     def interior(self, x: Float[np.ndarray, " unknowns"]) -> Interior:
@@ -215,10 +227,10 @@ class Vessel:
             numbers["level"] = float(np.clip(numbers["level"], low, high - least))
             numbers["gap"] = float(np.clip(numbers["gap"], least, high - numbers["level"]))
 
-        def tint(where: slice, otherwise: Colour) -> Colour:
+        def colour(where: slice, of: Callable[..., Any], otherwise: Colour) -> Colour:
             if where.stop == where.start:
                 return otherwise
-            red, green, blue = np.exp(x[where])
+            red, green, blue = of(x[where])
             return float(red), float(green), float(blue)
 
         return dataclasses.replace(
@@ -227,8 +239,9 @@ class Vessel:
             gap=numbers["gap"],
             glass=numbers["glass"],
             liquid=numbers["liquid"],
-            tint=tint(layout.tint, rest.tint),
-            glass_tint=tint(layout.glass_tint, rest.glass_tint),
+            tint=colour(layout.tint, np.exp, rest.tint),
+            absorption=colour(layout.absorption, _not_negative, rest.absorption),
+            glass_tint=colour(layout.glass_tint, np.exp, rest.glass_tint),
         )
 
     def pose(self, x: Float[np.ndarray, " unknowns"]) -> Candidate:
@@ -240,7 +253,9 @@ class Vessel:
         kinds += ["air"] * (_PARTS - len(kinds))
         index = {"glass": interior.glass, "liquid": interior.liquid, "air": 1.0}
         tint = {"glass": interior.glass_tint, "liquid": interior.tint, "air": (1.0, 1.0, 1.0)}
+        absorption = {"glass": _CLEAR, "liquid": interior.absorption, "air": _CLEAR}
         by_indices, by_tints = np.zeros((len(kinds), len(x))), np.zeros((3 * len(kinds), len(x)))
+        by_absorptions = np.zeros_like(by_tints)
         tints = {"glass": layout.glass_tint, "liquid": layout.tint}
         for number, kind in enumerate(kinds):
             if kind != "air":
@@ -248,16 +263,20 @@ class Vessel:
                 where = tints[kind]
                 rows = slice(3 * number, 3 * number + where.stop - where.start)
                 by_tints[rows, where] = np.eye(where.stop - where.start)
+            if kind == "liquid":
+                by_absorptions[3 * number : 3 * number + 3, layout.absorption] = np.eye(3)
         interfaces = nested(
             [index[kind] for kind in kinds],
             [NO_PARENT] + [0] * (len(kinds) - 1),
             tints=[tint[kind] for kind in kinds],
+            absorptions=[absorption[kind] for kind in kinds],
         )
         return Candidate(
             tuple(parts),
             interfaces,
             scipy.sparse.csr_array(by_indices),
             scipy.sparse.csr_array(by_tints),
+            scipy.sparse.csr_array(by_absorptions) if interior.filled else None,
         )
 
     def _kinds(self) -> list[str]:
@@ -366,8 +385,16 @@ class Vessel:
         now, candidate = self.interior(x), self.pose(x)
         tints = {"glass": now.glass_tint, "liquid": now.tint, "air": (1.0, 1.0, 1.0)}
         indices = {"glass": now.glass, "liquid": now.liquid, "air": 1.0}
+        absorptions = {"liquid": now.absorption}
         return [
-            Solid(name, mesh_of(part), indices[name], 0 if number else NO_PARENT, tints[name])
+            Solid(
+                name,
+                mesh_of(part),
+                indices[name],
+                0 if number else NO_PARENT,
+                tints[name],
+                absorptions.get(name, _CLEAR),
+            )
             for number, (name, part) in enumerate(zip(self._kinds(), candidate.parts, strict=True))
         ]
 
@@ -385,6 +412,7 @@ class Vessel:
             (layout.gap, _GAP * size),
             (layout.glass, _GLASS),
             (layout.liquid, _LIQUID),
+            (layout.absorption, _ABSORPTION / size),
         ):
             deviations[where] = deviation
         precision = np.diag(deviations**-2.0)
@@ -394,7 +422,7 @@ class Vessel:
                 bends = np.diff(np.eye(count), 2, axis=0)
                 precision[where, where] += bends.T @ bends / (bend * size) ** 2
         away = x - self.start()
-        away[layout.tint] = x[layout.tint]
+        away[layout.tint], away[layout.absorption] = x[layout.tint], x[layout.absorption]
         away[layout.glass_tint] = x[layout.glass_tint]
         return precision, precision @ away
 
@@ -407,7 +435,12 @@ class Vessel:
         found[layout.level] = found[layout.gap] = _LEVEL_STEP * size
         found[layout.glass] = found[layout.liquid] = _INDEX_STEP
         found[layout.tint] = found[layout.glass_tint] = _TINT_STEP
+        found[layout.absorption] = _ABSORPTION_STEP / size
         return found
+
+
+def _not_negative(values: np.ndarray) -> np.ndarray:
+    return np.maximum(values, 0.0)
 
 
 def _size(points: Curve) -> float:

@@ -137,6 +137,7 @@ class Sensitivities(NamedTuple):
       slopes: derivatives of the pixel's linear RGB by the coordinates.
       light: linear RGB that the main path contributes.
       crossings: number of times that the main path meets each part.
+      lengths: length of the main path in the medium of each part, world units.
       coverage: number of pixels that see the backdrop where the path ends.
       usable: whether the path leaves the object within the number of bends.
     """
@@ -148,6 +149,7 @@ class Sensitivities(NamedTuple):
     slopes: Float[Any, "rays 3 3"]
     light: Float[Any, "rays 3"]
     crossings: Int[Any, "rays parts"]
+    lengths: Float[Any, "rays parts"]
     coverage: Float[Any, " rays"]
     usable: Bool[Any, " rays"]
 
@@ -289,10 +291,15 @@ def _differentiate(
     normals = scene.surfaces.normals[primitives]
     parts = scene.surfaces.parts[primitives]
     indices = scene.interfaces.index_inside
-    by = jax.jacrev(replay, argnums=(0, 1, 2), has_aux=True)
-    (by_corners, by_normals, by_indices), ends = jax.vmap(by, in_axes=(0, 0, None, 0, 0, 0))(
-        triangles, normals, indices, parts, primitives, rays
+    absorptions = scene.interfaces.absorption
+    by = jax.jacrev(replay, argnums=(0, 1, 2, 3), has_aux=True)
+    found_by, ends = jax.vmap(by, in_axes=(0, 0, None, None, 0, 0, 0))(
+        triangles, normals, indices, absorptions, parts, primitives, rays
     )
+    by_corners, by_normals, by_indices, by_absorptions = found_by
+    share = jnp.mean(ends.throughput, axis=-1)
+    # The share falls by its own size for each unit of length and of absorption.
+    lengths = -jnp.sum(by_absorptions[:, 2], axis=-1) / jnp.maximum(share, _LITTLE)[:, None]
     count = rays.radii.shape[0]
     numbers = jnp.arange(count, dtype=jnp.int32)
     lookups = backdrop.locate(domain, ends, numbers, resolution=resolution, most_taps=_TAPS)
@@ -310,10 +317,11 @@ def _differentiate(
         slopes=slopes,
         light=radiance,
         crossings=crossings,
+        lengths=lengths,
         coverage=backdrop.radiance(coverage, lookups)[:, 0],
         usable=ends.statuses == PathStatus.ESCAPED,
     )
-    return found, radiance, jnp.mean(ends.throughput, axis=-1)
+    return found, radiance, share
 
 
 def _replay(
@@ -322,6 +330,7 @@ def _replay(
     corners: Float[Array, "casts 3 3"],
     normals: Float[Array, "casts 3 3"],
     indices: Float[Array, " parts"],
+    absorptions: Float[Array, "parts 3"],
     parts: Int[Array, " casts"],
     primitives: Int[Array, " casts"],
     ray: Rays,
@@ -329,7 +338,8 @@ def _replay(
     """Returns the coordinates of the main path of one ray, through the triangles given."""
     bvh = scene.surfaces.bvh._replace(triangles=corners)
     surfaces = scene.surfaces._replace(bvh=bvh, normals=normals, parts=parts)
-    local = Scene(surfaces, with_indices(scene.interfaces, indices))
+    interfaces = with_indices(scene.interfaces, indices)._replace(absorption=absorptions)
+    local = Scene(surfaces, interfaces)
     casts = jnp.arange(primitives.shape[0], dtype=jnp.int32)
     path = follow_branch(
         local,

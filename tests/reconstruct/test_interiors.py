@@ -204,6 +204,25 @@ def test_level_index_and_tint_are_recovered(body, surface, photographs):
     assert found.tint == pytest.approx(_FLASK.tint, abs=0.02)
 
 
+def test_an_absorbing_liquid_is_told_from_a_tinted_surface(body, surface):
+    wine = dataclasses.replace(_FLASK, tint=(1.0, 1.0, 1.0), absorption=(0.1, 1.2, 0.8))
+    rays, views = lit_scenes.pixels(4096, reach=0.6)
+    truth = Vessel(body, wine, _SMALL)
+    scene = gauss_newton.traced_object(truth.pose(truth.start()))
+    rgb = photometry.encode(photometry.predict(scene, surface, rays).linear)
+    seen = Photographs(jax.device_get(rays), rgb, views)
+    vessel = Vessel(body, dataclasses.replace(_FLASK, tint=(0.9, 0.5, 0.6)), _SMALL)
+    layout = vessel.layout
+    few = Few(vessel, vessel.start(), np.eye(layout.count)[:, layout.tint.start :])
+    steps = gauss_newton.Steps((1, 1, *[0] * 8), 4096, 4096)
+    fit = gauss_newton.fit(few, few.start(), surface, seen, settings=steps)
+    found = vessel.interior(few.whole(fit.x))
+    assert found.absorption == pytest.approx(wine.absorption, abs=0.05)
+    assert found.tint == pytest.approx(wine.tint, abs=0.04)
+    solids = vessel.solids(few.whole(fit.x))
+    assert [each.absorption for each in solids] == [(0.0,) * 3, found.absorption, (0.0,) * 3]
+
+
 def test_the_simplest_of_equally_good_findings_is_kept(body, surface, photographs):
     def finding(interior):
         vessel = Vessel(body, interior, _SMALL)

@@ -210,7 +210,8 @@ def _changed(ball, kind, t):
     normals, nothing = posed.normals, np.zeros((3 * len(posed.normals), 1))
     vertices, index, tint = posed.vertices, _INDEX, np.ones(3)
     by_vertices, by_normals = nothing, nothing
-    by_index, by_tint = np.zeros((1, 1)), np.zeros((3, 1))
+    by_index, by_tint, by_absorption = np.zeros((1, 1)), np.zeros((3, 1)), np.zeros((3, 1))
+    absorption = np.zeros(3)
     if kind == "vertices":
         shift = _bumps(normals)[:, None] * normals
         vertices, by_vertices = vertices + t * shift, shift.reshape(-1, 1)
@@ -219,8 +220,10 @@ def _changed(ball, kind, t):
         normals = unit_vectors(normals + t * _sideways(normals))
     elif kind == "index":
         index, by_index = index + t, np.ones((1, 1))
-    else:
+    elif kind == "tint":
         tint, by_tint = np.exp(t * _SHARES), _SHARES[:, None]
+    else:
+        absorption, by_absorption = (0.3 + t) * _SHARES, _SHARES[:, None]
     part = Posed(
         vertices,
         posed.faces,
@@ -228,8 +231,11 @@ def _changed(ball, kind, t):
         posed.normal_ids,
         *map(scipy.sparse.csr_array, (by_vertices, by_normals)),
     )
-    interfaces = nested([index], [NO_PARENT], tints=[tint.tolist()])
-    return Candidate((part,), interfaces, *map(scipy.sparse.csr_array, (by_index, by_tint)))
+    interfaces = nested(
+        [index], [NO_PARENT], tints=[tint.tolist()], absorptions=[absorption.tolist()]
+    )
+    changes = (by_index, by_tint, by_absorption)
+    return Candidate((part,), interfaces, *map(scipy.sparse.csr_array, changes))
 
 
 def _slopes_of(candidate, surface, rays):
@@ -239,7 +245,9 @@ def _slopes_of(candidate, surface, rays):
     found = photometry.sensitivities(body, surface, rays, predicted)
     coordinates = gauss_newton._by_unknowns(candidate, body, found)
     slopes = gauss_newton._block_diagonal(np.swapaxes(found.slopes, 1, 2)) @ coordinates
-    slopes = slopes.toarray() + gauss_newton._by_tints(candidate, found.light, found.crossings)
+    by_channels = functools.partial(gauss_newton._by_channels, found.light)
+    slopes = slopes.toarray() + by_channels(found.crossings) @ candidate.by_tints
+    slopes = slopes - by_channels(found.lengths) @ candidate.by_absorptions
     return np.asarray(slopes).reshape(-1, 3), found
 
 
@@ -251,6 +259,7 @@ def _slopes_of(candidate, surface, rays):
         ("index", 2e-3, 0.05),
         # The main path alone is differentiated by a tint; a tenth of the light takes other ways.
         ("tint", 1e-2, 0.12),
+        ("absorption", 1e-2, 0.12),
     ],
 )
 def test_sensitivities_are_central_differences_of_predictions(world, ball, kind, step, off):
