@@ -21,6 +21,9 @@ _LIGHT = np.array([-0.4, 0.5, 0.77])
 # Indices below which a part is drawn as air, and from which it is drawn as glass.
 _AIR, _GLASS = 1.05, 1.44
 
+# Largest share of light that a clear medium takes.
+_CLEAR = 0.05
+
 # Colours of glass, of clear liquids, and of the walls around air.
 _GLASS_COLOUR, _LIQUID_COLOUR, _WALL_COLOUR = (
     np.array(colour) for colour in ((0.56, 0.67, 0.74), (0.45, 0.7, 0.95), (0.88, 0.92, 0.94))
@@ -31,7 +34,7 @@ def write(path: Path, parts: Sequence[MeshPart], truth: Sequence[MeshPart] = ())
     """Writes a figure of an object: cut open, and its cross-section.
 
     The half that is nearer to the camera is removed. Cut glass is grey, a cut liquid has the colour
-    of light that crosses it twice, and where there is air its walls are seen.
+    of light that went through a unit of it, and where there is air its walls are seen.
 
     Args:
       path: file to write.
@@ -53,6 +56,7 @@ def write(path: Path, parts: Sequence[MeshPart], truth: Sequence[MeshPart] = ())
             for loop in _cross_section(part, middle):
                 axes[-1].plot(*np.append(loop, loop[:1], axis=0).T, style, color=colour, lw=1.2)
     axes[-1].set(title="cross-section", xlabel="world units")
+    axes[-1].locator_params(axis="x", nbins=3)
     axes[-1].set_aspect("equal")
     if truth:
         axes[-1].plot([], [], "-", color="#000000", label="true")
@@ -135,9 +139,10 @@ def _in_camera(
 
 def _cut_colour(part: MeshPart) -> Float[np.ndarray, "3"]:
     """Returns the colour of a cut."""
-    tint = np.asarray(part.tint, float)
+    left = np.asarray(part.tint, float) ** 2 * np.exp(-np.asarray(part.absorption, float))
     base = _GLASS_COLOUR if part.index >= _GLASS else _LIQUID_COLOUR
-    return base if np.allclose(tint, 1.0) else np.clip(tint**2, 0.0, 1.0) ** (1.0 / 2.2)
+    clear = np.allclose(left, 1.0, atol=_CLEAR)
+    return base if clear else np.clip(left, 0.0, 1.0) ** (1.0 / 2.2)
 
 
 def _surface_colour(part: MeshPart) -> Float[np.ndarray, "3"]:
