@@ -6,10 +6,11 @@
 Families of shapes and a free surface are fitted to pixels of the training views, together with the
 index (`reconstruct.shape_from_refraction`). If the object is a body of revolution, and no solid
 glass explains its pixels, the stage looks at what may be inside instead of a free surface
-(`reconstruct.interior_search`); a vessel becomes several parts, and so does a solid with bubbles of
-air (`reconstruct.bubbles`). Pixels that were not fitted judge: those of the validation views, or of
-every eighth training view where these have no masks. Where the background is a field, and where
-light explains nothing better, the surface stays as it is.
+(`reconstruct.interior_search`). In a solid that was chosen, it looks for bubbles of air
+(`reconstruct.bubble_search`). Vessels and solids with bubbles become several parts. Pixels that
+were not fitted judge: those of the validation views, or of every eighth training view where these
+have no masks. Where the background is a field, and where light explains nothing better, the surface
+stays as it is.
 """
 
 import itertools
@@ -34,7 +35,7 @@ from refref_jax.geometry.surfaces import pack_meshes
 from refref_jax.geometry.triangle_meshes import Mesh, face_vectors, volume
 from refref_jax.reconstruct import (
     ReconstructionError,
-    bubbles,
+    bubble_search,
     families,
     gauss_newton,
     interior_looks,
@@ -264,7 +265,7 @@ def _with_bubbles(
     if no place inside is passed by lines whose errors are above those elsewhere.
     """
     with ProgressBar("bubbles", 100) as bar:
-        found = bubbles.find_bubbles(
+        found = bubble_search.find_bubbles(
             chosen,
             surface,
             seen.fitted,
