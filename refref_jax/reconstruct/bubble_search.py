@@ -29,7 +29,7 @@ from scipy.optimize import minimize
 
 from refref_jax.geometry.triangle_meshes import diameter
 from refref_jax.reconstruct import ReconstructionError, gauss_newton, photometry
-from refref_jax.reconstruct.bubbles import Bubble, ObjectWithBubbles, room_inside
+from refref_jax.reconstruct.bubbles import Bubble, ObjectWithBubbles, depth_inside
 from refref_jax.reconstruct.gauss_newton import Candidate, Fit, Rows, Steps
 from refref_jax.reconstruct.interior_search import Few
 from refref_jax.reconstruct.model_selection import Trial, choose, judged
@@ -195,7 +195,7 @@ class _Task(NamedTuple):
         """Returns the best of a few radii and its gain, `None` if none helps."""
         settings, size = self.settings, diameter(found.mesh.vertices)
         guess = _shadow(segments, errors, peak.centre, _REACH * size)
-        if not room_inside(guess.centre, found.candidate.parts[0]).depth > 0.0:
+        if not depth_inside(guess.centre, found.candidate.parts[0]).distance > 0.0:
             return None
         radii = [share * guess.radius for share in settings.radii]
         near = np.flatnonzero(_distances(segments, guess.centre) <= 1.5 * max(radii))
@@ -327,7 +327,7 @@ def peaks(
     found = []
     for place in sorted(places, key=lambda place: -mean[tuple(place)]):
         centre = low + (place + 0.5) * cell
-        if room_inside(centre, outer).depth > _DEPTH * cell:
+        if depth_inside(centre, outer).distance > _DEPTH * cell:
             found.append(Peak(centre, float(mean[tuple(place)]), level, scatter))
         if len(found) == settings.peaks:
             break

@@ -62,18 +62,18 @@ class _Ball(NamedTuple):
     by: scipy.sparse.csr_array
 
 
-class Room(NamedTuple):
+class Depth(NamedTuple):
     """How far a point is from the nearest obstacle.
 
     Attributes:
-      depth: distance, world units; negative beyond the obstacle.
+      distance: world units; negative beyond the obstacle.
       away: unit direction in which it grows.
       by_obstacle: derivatives of the depth by the unknowns of the obstacle.
       curvature: derivatives of the direction as the point moves across it, per world unit.
       other: derivatives of the place of the obstacle, for the same.
     """
 
-    depth: float
+    distance: float
     away: Float[np.ndarray, "3"]
     by_obstacle: scipy.sparse.csr_array
     curvature: float = 0.0
@@ -116,7 +116,7 @@ class ObjectWithBubbles:
         outer = solid.pose(x).parts[0]
         self._size = diameter(outer.vertices)
         for each in bubbles:
-            if not each.radius > 0.0 or not room_inside(each.centre, outer).depth > 0.0:
+            if not each.radius > 0.0 or not depth_inside(each.centre, outer).distance > 0.0:
                 raise ReconstructionError(
                     f"A bubble of radius {each.radius:g} at {each.centre} is not inside the "
                     "object. Pass a centre inside and a positive radius."
@@ -162,9 +162,9 @@ class ObjectWithBubbles:
         found: list[_Ball] = []
         for first in range(self.own, len(x), 4):
             by = scipy.sparse.eye_array(len(x)).tocsr()[first : first + 4]
-            rooms = [room_inside(x[first : first + 3], outer)]
-            rooms += [_room_beside(x[first : first + 3], ball) for ball in found]
-            tightest = min(rooms, key=lambda room: room.depth)
+            depths = [depth_inside(x[first : first + 3], outer)]
+            depths += [_depth_beside(x[first : first + 3], ball) for ball in found]
+            tightest = min(depths, key=lambda depth: depth.distance)
             found.append(_limited(x[first : first + 4], by, tightest, least, gap))
         return found
 
@@ -216,7 +216,7 @@ def _widened(matrix: Matrix, columns: int, *, rows: int | None = None) -> scipy.
     return scipy.sparse.csr_array((found.data, (found.row, found.col)), shape=shape)
 
 
-def room_inside(point: Float[np.ndarray, "3"], outer: Posed) -> Room:
+def depth_inside(point: Float[np.ndarray, "3"], outer: Posed) -> Depth:
     """Returns how deep a point is inside a surface.
 
     Args:
@@ -245,36 +245,36 @@ def room_inside(point: Float[np.ndarray, "3"], outer: Posed) -> Room:
     weights = -(shares[:, None] * away)
     by_vertices = scipy.sparse.csr_array(outer.by_vertices)[rows.ravel()]
     by = scipy.sparse.csr_array(weights.reshape(1, -1)) @ by_vertices
-    return Room(side * length, away, by)
+    return Depth(side * length, away, by)
 
 
-def _room_beside(point: Float[np.ndarray, "3"], ball: _Ball) -> Room:
+def _depth_beside(point: Float[np.ndarray, "3"], ball: _Ball) -> Depth:
     """Returns how far a point is outside another ball."""
     away = point - ball.values[:3]
     length = float(np.linalg.norm(away))
     away = away / length if length > 0.0 else np.array([1.0, 0.0, 0.0])
     row = scipy.sparse.csr_array(np.append(-away, -1.0)[None])
     curvature = 1.0 / length if length > 0.0 else 0.0
-    return Room(length - float(ball.values[3]), away, row @ ball.by, curvature, ball.by[:3])
+    return Depth(length - float(ball.values[3]), away, row @ ball.by, curvature, ball.by[:3])
 
 
 def _limited(
     values: Float[np.ndarray, "4"],
     by: scipy.sparse.csr_array,
-    room: Room,
+    depth: Depth,
     least: float,
     gap: float,
 ) -> _Ball:
     """Returns a ball that leaves a gap to an obstacle and has at least a radius."""
-    centre, radius, away = values[:3], float(values[3]), room.away[:, None]
+    centre, radius, away = values[:3], float(values[3]), depth.away[:, None]
     by_centre, by_radius = by[:3], by[3:]
-    by_depth = scipy.sparse.csr_array(away.T) @ by_centre + room.by_obstacle
-    most, missing = room.depth - gap, least + gap - room.depth
+    by_depth = scipy.sparse.csr_array(away.T) @ by_centre + depth.by_obstacle
+    most, missing = depth.distance - gap, least + gap - depth.distance
     if missing > 0.0:
-        centre = centre + missing * room.away
-        if room.other is not None:
+        centre = centre + missing * depth.away
+        if depth.other is not None:
             across = scipy.sparse.csr_array(np.eye(3) - away @ away.T)
-            by_centre = by_centre + missing * room.curvature * (across @ (by[:3] - room.other))
+            by_centre = by_centre + missing * depth.curvature * (across @ (by[:3] - depth.other))
         by_centre = by_centre - scipy.sparse.csr_array(away) @ by_depth
         most, by_depth = least, 0.0 * by_depth
     if radius > most:
