@@ -6,9 +6,11 @@
 Families of shapes and a free surface are fitted to pixels of the training views, together with the
 index (`reconstruct.shape_from_refraction`). If the object is a body of revolution, and no solid
 glass explains its pixels, the stage looks at what may be inside instead of a free surface
-(`reconstruct.interior_search`); a vessel becomes several parts. Pixels that were not fitted judge:
-those of the validation views, or of every eighth training view where these have no masks. Where the
-background is a field, and where light explains nothing better, the surface stays as it is.
+(`reconstruct.interior_search`). In a solid that was chosen, it looks for bubbles of air
+(`reconstruct.bubble_search`). Vessels and solids with bubbles become several parts. Pixels that
+were not fitted judge: those of the validation views, or of every eighth training view where these
+have no masks. Where the background is a field, and where light explains nothing better, the surface
+stays as it is.
 """
 
 import itertools
@@ -33,6 +35,7 @@ from refref_jax.geometry.surfaces import pack_meshes
 from refref_jax.geometry.triangle_meshes import Mesh, face_vectors, volume
 from refref_jax.reconstruct import (
     ReconstructionError,
+    bubble_search,
     families,
     gauss_newton,
     interior_looks,
@@ -41,6 +44,7 @@ from refref_jax.reconstruct import (
     photometry,
     shape_from_refraction,
 )
+from refref_jax.reconstruct.bubbles import ObjectWithBubbles
 from refref_jax.reconstruct.families import Revolution
 from refref_jax.reconstruct.interior_looks import SearchSettings
 from refref_jax.reconstruct.interior_search import Finding
@@ -122,7 +126,7 @@ def run(
     deviations = model_selection.normal_deviations(chosen) if kept else None
     parts: tuple[PartFacts, ...] = ()
     with atomic_files.written_folder(target.parent) as folder:
-        if kept and isinstance(chosen.model, Vessel):
+        if kept and isinstance(chosen.model, Vessel | ObjectWithBubbles):
             solids = chosen.model.solids(chosen.fit.x)
             parts = _write_parts(folder, target.stem, solids, known)
         elif kept:
@@ -149,7 +153,8 @@ def choose(scene: Path, mesh: Mesh, trials: Sequence[Trial]) -> tuple[Trial, Tri
     """Returns the mesh from masks, the chosen trial, and the reason if both are the same.
 
     Trials that change the volume are left out; that of a vessel is of its glass alone, so that only
-    its outer wall, which comes from masks, says that it is the same object.
+    its outer wall, which comes from masks, says that it is the same object. Bubbles were found in
+    the chosen shape, and judged by the pixels that see them: they come with it.
     """
     masks, *others = trials
     most = max(_VOLUME_CHANGE, _volume_of_a_pixel(scene, mesh))
@@ -158,11 +163,12 @@ def choose(scene: Path, mesh: Mesh, trials: Sequence[Trial]) -> tuple[Trial, Tri
         for trial in others
         if not isinstance(trial.model, Vessel)
     }
-    chosen = model_selection.choose(
-        [masks, *(trial for trial in others if not complaints.get(trial.name))]
-    )
+    left = [trial for trial in others if not complaints.get(trial.name)]
+    plain = [trial for trial in left if not isinstance(trial.model, ObjectWithBubbles)]
+    bubbly = [trial for trial in left if isinstance(trial.model, ObjectWithBubbles)]
+    chosen = model_selection.choose([masks, *plain])
     if chosen is not masks:
-        return masks, chosen, ""
+        return masks, bubbly[-1] if bubbly else chosen, ""
     best = min(trials, key=lambda trial: trial.error)
     if complaint := complaints.get(best.name):
         return masks, masks, f"the {best.name} was rejected: {complaint}"
@@ -180,7 +186,7 @@ def _volume_of_a_pixel(scene: Path, mesh: Mesh) -> float:
 def _write_parts(
     folder: Path, stem: str, solids: Sequence[Solid], known: IndexFacts
 ) -> tuple[PartFacts, ...]:
-    """Writes the parts of a vessel; their files are named after materials of nearly their index."""
+    """Writes the parts; their files are named after materials of nearly their index."""
     facts, name = [], stem.rsplit("_", 1)[0]
     for solid in solids:
         material = min(_MATERIALS, key=lambda each: abs(each[1] - solid.index))[0]
@@ -214,6 +220,8 @@ def fit(
 ) -> tuple[Trial, ...]:
     """Fits vessels, or else all shapes that come near the mesh; the mesh itself comes first.
 
+    If bubbles are found in the shape that is chosen, it comes once more with them, as the last.
+
     Args:
       scene: folder of the scene.
       mesh: mesh from masks.
@@ -239,10 +247,35 @@ def fit(
             progress=lambda share, text: bar.show(round(100 * share), text),
             **options,
         )
-    if not _may_be_vessel(outer, trials):
+    if _may_be_vessel(outer, trials):
+        outlines = Outlines(views, seed=seed)
+        trials = (*trials, *_vessels(outer, known, surface, seen, outlines, seed=seed))
+    masks, chosen, _ = choose(scene, mesh, trials)
+    if chosen is masks or isinstance(chosen.model, Vessel):
         return trials
-    outlines = Outlines(views, seed=seed)
-    return (*trials, *_vessels(outer, known, surface, seen, outlines, seed=seed))
+    outlines = Outlines(views, common=_WIDER, seed=seed)
+    return (*trials, *_with_bubbles(chosen, surface, seen, outlines, seed=seed))
+
+
+def _with_bubbles(
+    chosen: Trial, surface: Backdrop, seen: Seen, outlines: Outlines, *, seed: int
+) -> list[Trial]:
+    """Returns a shape with the bubbles that are found in it; nothing if there are none.
+
+    The search itself finds out whether it is worth while: it ends after one picture of some pixels
+    if no place inside is passed by lines whose errors are above those elsewhere.
+    """
+    with ProgressBar("bubbles", 100) as bar:
+        found = bubble_search.find_bubbles(
+            chosen,
+            surface,
+            seen.fitted,
+            seen.judges,
+            outlines=outlines,
+            seed=seed,
+            progress=lambda share, text: bar.show(round(100 * share), text),
+        )
+    return [] if found is chosen else [found]
 
 
 def _may_be_vessel(outer: Revolution | None, trials: Sequence[Trial]) -> bool:

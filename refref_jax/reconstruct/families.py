@@ -82,10 +82,12 @@ class Sphere:
 
     name = "sphere"
 
-    def __init__(self, centre: Float[np.ndarray, "3"], radius: float) -> None:
-        """Takes the centre and the radius in world units."""
+    def __init__(
+        self, centre: Float[np.ndarray, "3"], radius: float, *, subdivisions: int = _SUBDIVISIONS
+    ) -> None:
+        """Takes the centre and the radius in world units, and how fine the mesh is."""
         self._start = np.append(centre, radius)
-        ball = icosphere(subdivisions=_SUBDIVISIONS)
+        ball = icosphere(subdivisions=subdivisions)
         self._faces = np.asarray(ball.faces, np.int64)
         directions = np.asarray(ball.vertices, np.float64)
         self._directions = directions / np.linalg.norm(directions, axis=-1, keepdims=True)

@@ -154,6 +154,20 @@ class Sensitivities(NamedTuple):
     usable: Bool[Any, " rays"]
 
 
+class InnerSegments(NamedTuple):
+    """Segments of main paths, in order.
+
+    Attributes:
+      starts: where they begin, world units.
+      ends: where they end.
+      inside: whether a segment lies in the object; the other fields have no meaning elsewhere.
+    """
+
+    starts: Float[Any, "rays segments 3"]
+    ends: Float[Any, "rays segments 3"]
+    inside: Bool[Any, "rays segments"]
+
+
 def assemble(
     corners: Float[np.ndarray, "faces 3 3"],
     normals: Float[np.ndarray, "faces 3 3"],
@@ -212,6 +226,28 @@ def predict(traced: TracedObject, surface: Backdrop, rays: Rays) -> Prediction:
         )
 
     return _in_tiles(render, rays)
+
+
+def inner_segments(traced: TracedObject, rays: Rays) -> InnerSegments:
+    """Returns the segments of the main paths inside the object, as a list for each ray.
+
+    Segments in parts of the object's parts, such as bubbles, count as inside. Paths that do not
+    leave the object within the number of bends have none.
+
+    Args:
+      traced: the object.
+      rays: rays of pixels.
+    """
+    return _in_tiles(lambda part: _inner_segments(traced.scene, part), rays)
+
+
+@jax.jit
+def _inner_segments(scene: Scene, rays: Rays) -> InnerSegments:
+    ahead = jnp.zeros(MAIN.max_bends, bool)
+    paths = jax.vmap(lambda ray: follow_branch(scene, ray, ahead, settings=MAIN))(rays)
+    bounded = jnp.isfinite(paths.tau[:, 1:]) & (paths.media[:, :-1] != AMBIENT)
+    inside = bounded & (paths.statuses == PathStatus.ESCAPED)[:, None]
+    return InnerSegments(paths.points[:, :-1], paths.points[:, 1:], inside)
 
 
 def sensitivities(
