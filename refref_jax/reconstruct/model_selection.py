@@ -122,13 +122,14 @@ def compare(trial: Trial, best: Trial) -> Comparison:
 def choose(trials: Sequence[Trial]) -> Trial:
     """Returns the trial of fewest unknowns that is not worse than the best by two standard errors.
 
-    A difference of less than a quarter of an 8-bit level does not count.
+    A difference of less than a quarter of an 8-bit level does not count. Of trials with as many
+    unknowns, the better one comes first.
 
     Args:
       trials: one or more trials.
     """
     best = min(trials, key=lambda trial: trial.error)
-    for trial in sorted(trials, key=lambda trial: len(trial.fit.x)):
+    for trial in sorted(trials, key=lambda trial: (len(trial.fit.x), trial.error)):
         worse = compare(trial, best)
         if worse.mean <= max(_WORSE * worse.error, _LEVEL):
             return trial

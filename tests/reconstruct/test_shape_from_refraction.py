@@ -553,6 +553,9 @@ def test_the_smallest_shape_within_two_standard_errors_is_chosen():
     assert choose([_trial("sphere", 5, best.by_view + 1.1e-3), best]) is best
     within = _trial("sphere", 5, best.by_view + 0.9e-3)
     assert choose([within, best]) is within
+    # Of two with as many unknowns, neither is smaller: the better one is chosen.
+    other = _trial("torus", 5, best.by_view + 0.5e-3)
+    assert choose([within, other, best]) is other
 
 
 def test_one_view_has_no_standard_error():
