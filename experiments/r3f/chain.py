@@ -228,10 +228,12 @@ def _describe_light(facts: LightFacts) -> str:
     if facts.before is None:
         return f"refinement by light: none, since {facts.remark}"
     line = f"refinement by light: error of {report.JUDGES[facts.split]} {facts.before:.4f} before"
-    if not facts.kept:
-        return f"{line}; the surface from masks stays, since {facts.remark}"
     deviation = "" if facts.deviation is None else f" +- {facts.deviation:.4f}"
-    return f"{line}, {facts.after:.4f} after; {facts.shape}, index {facts.index:.4f}{deviation}"
+    if facts.kept:
+        line += f", {facts.after:.4f} after; {facts.shape}, index {facts.index:.4f}{deviation}"
+    else:
+        line += f"; the surface from masks stays, since {facts.remark}"
+    return f"{line}\nwarning: {facts.doubt}" if facts.doubt else line
 
 
 def _describe_geometry(found: Reconstruction) -> str:

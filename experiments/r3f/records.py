@@ -23,6 +23,9 @@ FILE = "reconstruction.json"
 Refinement = Literal["light", "none"]
 """What refines the surface from masks."""
 
+# Error of the judges above which no model has explained the object, sRGB.
+_DOUBTFUL = 0.06
+
 # Earlier versions had a number of steps here.
 _FORMER_STEPS = dict.fromkeys(range(1, 10_001), "light") | {0: "none"}
 
@@ -181,6 +184,16 @@ class LightFacts:
     parts: tuple[PartFacts, ...] = ()
     steps: int | None = None
     furthest: float | None = None
+
+    @property
+    def doubt(self) -> str:
+        """Why the object should not be trusted, empty where nothing speaks against it."""
+        if self.after is None or self.after <= _DOUBTFUL:
+            return ""
+        return (
+            f"an error of {self.after:.4f} is left, so the object has something that no model here "
+            "has. Compare with straight rays: train --paths=straight"
+        )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -332,6 +332,7 @@ def _of_light(found: Reconstruction) -> list[str]:
         f"{JUDGES[light.split]}; deviations are one standard error.",
         "\n".join(lines),
         chosen,
+        *([f"**Warning:** {light.doubt}"] if light.doubt else []),
         "![Pixels before and after, and the uncertainty of the normals](light/errors.png)",
     ]
 

@@ -382,6 +382,18 @@ def test_a_body_that_light_blew_up_is_left_out(scene, monkeypatch, tmp_path):
     assert facts.deviation is None and facts.undetermined == 1.0
 
 
+@pytest.mark.parametrize(("after", "doubted"), [(0.03, False), (0.09, True)])
+def test_an_object_that_no_model_explains_is_told(after, doubted):
+    facts = records.LightFacts(
+        kept=True, index=1.99, shape="vessel: liquid", before=0.11, after=after
+    )
+    line = chain._describe_light(facts)
+    assert line.startswith("refinement by light: error of validation views 0.1100 before")
+    assert ("warning: an error of 0.0900 is left" in line) == doubted
+    found = dataclasses.replace(records.Reconstruction("ball", "", _CONFIG), light=facts)
+    assert any("straight rays" in part for part in report._of_light(found)) == doubted
+
+
 def test_before_a_field_there_is_no_refinement_by_light(scene, whole, tmp_path, monkeypatch):
     out = tmp_path / "out"
     shutil.copytree(whole, out)
