@@ -11,7 +11,7 @@ from experiments import notebooks
 
 pytestmark = pytest.mark.loose
 
-_NAMES = ("index_of_refraction", "light_paths", "quickstart", "your_scene")
+_NAMES = ("index_of_refraction", "light_paths", "quickstart", "what_is_inside", "your_scene")
 
 _STORED = [pytest.param(notebooks.FOLDER / f"{name}.ipynb", id=name) for name in _NAMES]
 
