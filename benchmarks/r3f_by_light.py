@@ -11,7 +11,7 @@ with the scene's own meshes: masked PSNR on the test split, with a backdrop and,
 `--field_steps`, with a field. With `--straight_steps` a field is trained along straight rays, too.
 Finished reconstructions and trainings are reused.
 
-Of a vessel with liquid the level, both indices and the tint are printed, too.
+Of a vessel with liquid the level, both indices, tints and absorption are printed, too.
 
 Asserted are the bounds of `_MUST` for the scenes named there, for all others that light is no worse
 than masks, and with `--straight_steps` that light is 3 dB better than straight rays.
@@ -138,16 +138,19 @@ def _measure_inside(
     true, ours = (
         {_kind(p): p for p in each} for each in (parts, object_source.read_parts(out, found))
     )
-    if set(true) != set(ours):
-        return [f"{name}: {sorted(ours)} were found, {sorted(true)} are there"]
-    print("| part | index | truth | tint | truth | top | truth |\n|---|---|---|---|---|---|---|")
+    print("| part | index | truth | tint | truth | absorption | truth | top | truth |")
+    print("|---|---|---|---|---|---|---|---|---|")
     wrong = []
-    for kind, part in ours.items():
+    if set(true) != set(ours):
+        wrong.append(f"{name}: {sorted(ours)} were found, {sorted(true)} are there")
+    for kind in sorted(set(true) & set(ours)):
+        part = ours[kind]
         tops = [float(each.vertices[:, 2].max()) for each in (part, true[kind])]
         tints = [np.asarray(each.tint) for each in (part, true[kind])]
         print(
             f"| {kind} | {part.index:.4f} | {true[kind].index:g} | {np.round(tints[0], 3)} | "
-            f"{tints[1]} | {tops[0]:.4f} | {tops[1]:.4f} |",
+            f"{tints[1]} | {np.round(part.absorption, 3)} | {true[kind].absorption} | "
+            f"{tops[0]:.4f} | {tops[1]:.4f} |",
             flush=True,
         )
         within = {
@@ -160,9 +163,9 @@ def _measure_inside(
 
 
 def _kind(part: meshes.MeshPart) -> str:
-    """Returns what a part is of: glass, air, or some liquid."""
+    """Returns what a part is of: glass, air, opaque matter, or some liquid."""
     word = part.name.split("_")[-1]
-    return word if word in ("glass", "air") else "liquid"
+    return word if word in ("glass", "air", "opaque") else "liquid"
 
 
 def _rows(out: Path, found: Reconstruction, parts: Sequence[meshes.MeshPart]) -> tuple[Row, ...]:
