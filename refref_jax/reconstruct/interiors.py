@@ -15,7 +15,7 @@ Single-View Transmission Imaging (2017), for outer and inner profiles from refra
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -23,8 +23,10 @@ import scipy.sparse
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
+from refref_jax.choices import CLEAR, NO_ABSORPTION
 from refref_jax.geometry.triangle_meshes import Mesh
 from refref_jax.optics.interface_rules import NO_PARENT, nested
+from refref_jax.optics.media import INDEX_OF_AIR
 from refref_jax.reconstruct import ReconstructionError, walls
 from refref_jax.reconstruct.contents import FINE, Colour, Detail, Interior, Layout
 from refref_jax.reconstruct.families import Revolution, place
@@ -69,9 +71,6 @@ _PARTS = 3
 # Fewest points of a piece of the inner wall.
 _FEWEST = 20
 
-# Absorption of a clear medium.
-_CLEAR: Colour = (0.0, 0.0, 0.0)
-
 # A mouth begins where the inner wall has turned this far from the horizontal.
 _UPRIGHT = 0.8
 
@@ -94,7 +93,19 @@ class Solid:
     index: float
     parent: int
     tint: Colour
-    absorption: Colour = _CLEAR
+    absorption: Colour = NO_ABSORPTION
+
+
+@dataclasses.dataclass(frozen=True)
+class _Medium:
+    """A material of a vessel, and where its unknowns are."""
+
+    index: float
+    tint: Colour
+    absorption: Colour
+    index_at: slice
+    tint_at: slice
+    absorption_at: slice
 
 
 class Vessel:
@@ -248,36 +259,34 @@ class Vessel:
         """Returns the vessel at given unknowns."""
         zeros = len(x) - 4 - self.layout.profile
         parts = [self._posed(outline, x, zeros) for outline in self._pieces(x)]
-        interior, layout = self.interior(x), self.layout
         kinds = self._kinds()
         kinds += ["air"] * (_PARTS - len(kinds))
-        index = {"glass": interior.glass, "liquid": interior.liquid, "air": 1.0}
-        tint = {"glass": interior.glass_tint, "liquid": interior.tint, "air": (1.0, 1.0, 1.0)}
-        absorption = {"glass": _CLEAR, "liquid": interior.absorption, "air": _CLEAR}
-        by_indices, by_tints = np.zeros((len(kinds), len(x))), np.zeros((3 * len(kinds), len(x)))
-        by_absorptions = np.zeros_like(by_tints)
-        tints = {"glass": layout.glass_tint, "liquid": layout.tint}
-        for number, kind in enumerate(kinds):
-            if kind != "air":
-                by_indices[number, getattr(layout, kind)] = 1.0
-                where = tints[kind]
-                rows = slice(3 * number, 3 * number + where.stop - where.start)
-                by_tints[rows, where] = np.eye(where.stop - where.start)
-            if kind == "liquid":
-                by_absorptions[3 * number : 3 * number + 3, layout.absorption] = np.eye(3)
+        media = [self._media(x)[kind] for kind in kinds]
         interfaces = nested(
-            [index[kind] for kind in kinds],
-            [NO_PARENT] + [0] * (len(kinds) - 1),
-            tints=[tint[kind] for kind in kinds],
-            absorptions=[absorption[kind] for kind in kinds],
+            [medium.index for medium in media],
+            [NO_PARENT] + [0] * (len(media) - 1),
+            tints=[medium.tint for medium in media],
+            absorptions=[medium.absorption for medium in media],
         )
         return Candidate(
             tuple(parts),
             interfaces,
-            scipy.sparse.csr_array(by_indices),
-            scipy.sparse.csr_array(by_tints),
-            scipy.sparse.csr_array(by_absorptions) if interior.filled else None,
+            _selected([medium.index_at for medium in media], 1, len(x)),
+            _selected([medium.tint_at for medium in media], 3, len(x)),
+            _selected([medium.absorption_at for medium in media], 3, len(x)),
         )
+
+    def _media(self, x: Float[np.ndarray, " unknowns"]) -> dict[str, _Medium]:
+        """Returns the materials at given unknowns, by their names."""
+        now, at, fixed = self.interior(x), self.layout, slice(0)
+        clear = NO_ABSORPTION
+        return {
+            "glass": _Medium(now.glass, now.glass_tint, clear, at.glass, at.glass_tint, fixed),
+            "liquid": _Medium(
+                now.liquid, now.tint, now.absorption, at.liquid, at.tint, at.absorption
+            ),
+            "air": _Medium(INDEX_OF_AIR, CLEAR, clear, fixed, fixed, fixed),
+        }
 
     def _kinds(self) -> list[str]:
         """Returns the material of each part."""
@@ -382,21 +391,13 @@ class Vessel:
 
         The part `glass` contains the others.
         """
-        now, candidate = self.interior(x), self.pose(x)
-        tints = {"glass": now.glass_tint, "liquid": now.tint, "air": (1.0, 1.0, 1.0)}
-        indices = {"glass": now.glass, "liquid": now.liquid, "air": 1.0}
-        absorptions = {"liquid": now.absorption}
-        return [
-            Solid(
-                name,
-                mesh_of(part),
-                indices[name],
-                0 if number else NO_PARENT,
-                tints[name],
-                absorptions.get(name, _CLEAR),
+        found: list[Solid] = []
+        for name, part in zip(self._kinds(), self.pose(x).parts, strict=True):
+            medium, parent = self._media(x)[name], 0 if found else NO_PARENT
+            found.append(
+                Solid(name, mesh_of(part), medium.index, parent, medium.tint, medium.absorption)
             )
-            for number, (name, part) in enumerate(zip(self._kinds(), candidate.parts, strict=True))
-        ]
+        return found
 
     def prior(
         self, x: Float[np.ndarray, " unknowns"]
@@ -437,6 +438,15 @@ class Vessel:
         found[layout.tint] = found[layout.glass_tint] = _TINT_STEP
         found[layout.absorption] = _ABSORPTION_STEP / size
         return found
+
+
+def _selected(places: Sequence[slice], each: int, count: int) -> scipy.sparse.csr_array:
+    """Returns the derivatives of `each` numbers of every part, which are unknowns or fixed."""
+    found = np.zeros((each * len(places), count))
+    for number, at in enumerate(places):
+        rows = np.eye(count)[at]
+        found[each * number : each * number + len(rows)] = rows
+    return scipy.sparse.csr_array(found)
 
 
 def _not_negative(values: np.ndarray) -> np.ndarray:

@@ -122,6 +122,20 @@ def test_levels_are_horizontal_where_they_should_be(body):
     assert (liquid.name, liquid.index, liquid.tint) == ("liquid", 1.36, (0.5, 0.8, 0.95))
 
 
+def test_a_liquid_never_adds_light(body):
+    vessel = Vessel(body, _FLASK, _TINY)
+    x = vessel.start()
+    x[vessel.layout.absorption] = [-0.7, 0.0, 40.0]
+    assert vessel.interior(x).absorption == (0.0, 0.0, 40.0)
+    found = vessel.pose(x)
+    np.testing.assert_array_equal(found.interfaces.absorption[1], [0.0, 0.0, 40.0])
+    assert not np.any(found.interfaces.absorption[[0, 2]])
+    # The derivative stays, so that a fit can leave zero again.
+    by = found.by_absorptions.toarray()[:, vessel.layout.absorption]
+    np.testing.assert_array_equal(by[3:6], np.eye(3))
+    assert not np.any(by[[0, 1, 2, 6, 7, 8]])
+
+
 def test_an_inset_of_a_cylinder_is_a_smaller_one():
     found = inset(Profile(revolved.even(revolved.cylinder(), 200), closed=False), 0.3, 2.0)
     assert found.points[:, 0].max() == pytest.approx(0.7, abs=2e-3)

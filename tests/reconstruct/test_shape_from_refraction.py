@@ -277,6 +277,21 @@ def test_sensitivities_are_central_differences_of_predictions(world, ball, kind,
     assert slopes @ expected / (slopes @ slopes) == pytest.approx(1.0, abs=off)
 
 
+@pytest.mark.parametrize("absorption", [0.0, 0.5, 1e6])
+def test_lengths_of_main_paths_are_chords_and_finite_in_the_dark(world, ball, absorption):
+    part = ball.pose(ball.start())
+    interfaces = nested([_INDEX], [NO_PARENT], absorptions=[[absorption] * 3])
+    nothing = [scipy.sparse.csr_array((n, 1)) for n in (1, 3, 3)]
+    body = gauss_newton.traced_object(Candidate((part,), interfaces, *nothing))
+    rays, _ = _rays(2, reach=0.85)
+    found = photometry.sensitivities(body, world, rays, photometry.predict(body, world, rays))
+    assert all(np.all(np.isfinite(each)) for each in found)
+    away = np.linalg.norm(np.cross(rays.origins, rays.directions), axis=-1)
+    chords = 2.0 * np.sqrt(1.0 - (away / _INDEX) ** 2)
+    if absorption < 1e3:
+        np.testing.assert_allclose(found.lengths[:, 0], chords, rtol=3e-3)
+
+
 def test_handles_of_a_free_surface_have_the_slopes_of_predictions(world, ball):
     model = SingleObject(FreeSurface(_ball_mesh(ball), 0.25), _INDEX)
     rays, _ = _rays(4, reach=0.85)

@@ -22,6 +22,7 @@ from experiments.r3f import (
 from experiments.r3f.records import ReconstructionConfig
 from refref_jax.data import meshes, scene_folder
 from refref_jax.geometry.triangle_meshes import corner_normals
+from refref_jax.reconstruct.bubbles import Bubble, ObjectWithBubbles
 from refref_jax.reconstruct.gauss_newton import Fit
 from refref_jax.reconstruct.mesh_distance import compare_meshes
 from refref_jax.reconstruct.model_selection import Trial
@@ -380,6 +381,31 @@ def test_a_body_that_light_blew_up_is_left_out(scene, monkeypatch, tmp_path):
     assert not facts.kept and not target.exists() and facts.index == 1.5
     assert facts.shape == "masks" and facts.remark.startswith("the sphere was rejected: ")
     assert facts.deviation is None and facts.undetermined == 1.0
+
+
+@pytest.mark.parametrize("growth", [1.0, 1.5])
+def test_bubbles_come_with_the_shape_that_is_chosen(scene, monkeypatch, tmp_path, growth):
+    mesh, bubble = bodies.icosphere(3), Bubble(np.array([0.2, 0.1, -0.3]), 0.15)
+    grown = mesh._replace(vertices=growth * mesh.vertices)
+    masks, solid = _trial("masks", mesh, 1.5, 0.04 + _VIEWS), _trial("ball", grown, 1.52, 0.03)
+    model = ObjectWithBubbles(solid.model, solid.fit.x, [bubble])
+    fit = Fit(model.start(), 1e-6 * np.eye(5), ())
+    solid = solid._replace(by_view=0.03 + _VIEWS)
+    # Few views see the bubble: by all of them, it is not significantly better.
+    bubbly = Trial("ball with 1 bubble", model, fit, 0.0299 + _VIEWS)
+    monkeypatch.setattr(light_stage, "fit", lambda *_, **options: (masks, solid, bubbly))
+    monkeypatch.setattr(light_stage, "draw", lambda path, *_: path.write_bytes(b"figure"))
+    known, target = records.IndexFacts("estimated", 1.5, 0.01, 0.04), tmp_path / "a" / "b_glass.ply"
+    facts = light_stage.run(scene, mesh, known, "surface", target, seed=0)
+    if growth > 1.0:  # the shape was rejected, and its bubbles with it
+        assert not facts.kept and facts.parts == ()
+        return
+    assert (facts.shape, facts.index) == ("ball with 1 bubble", pytest.approx(1.52))
+    assert [part.mesh for part in facts.parts] == ["b_glass_glass.ply", "b_bubble1_air.ply"]
+    assert [part.index for part in facts.parts] == pytest.approx([1.52, 1.0])
+    air = meshes.read_part(target.parent / facts.parts[1].mesh, index=1.0)
+    radii = np.linalg.norm(air.vertices - bubble.centre, axis=-1)
+    np.testing.assert_allclose(radii, bubble.radius, rtol=1e-5)
 
 
 @pytest.mark.parametrize(("after", "doubted"), [(0.03, False), (0.09, True)])
