@@ -165,10 +165,10 @@ def choose(scene: Path, mesh: Mesh, trials: Sequence[Trial]) -> tuple[Trial, Tri
     }
     left = [trial for trial in others if not complaints.get(trial.name)]
     plain = [trial for trial in left if not isinstance(trial.model, ObjectWithBubbles)]
-    bubbly = [trial for trial in left if isinstance(trial.model, ObjectWithBubbles)]
+    with_bubbles = [trial for trial in left if isinstance(trial.model, ObjectWithBubbles)]
     chosen = model_selection.choose([masks, *plain])
     if chosen is not masks:
-        return masks, bubbly[-1] if bubbly else chosen, ""
+        return masks, with_bubbles[-1] if with_bubbles else chosen, ""
     best = min(trials, key=lambda trial: trial.error)
     if complaint := complaints.get(best.name):
         return masks, masks, f"the {best.name} was rejected: {complaint}"
@@ -263,7 +263,7 @@ def _with_bubbles(
     """Returns a shape with the bubbles that are found in it; nothing if there are none.
 
     The search itself finds out whether it is worth while: it ends after one picture of some pixels
-    if no place inside is passed by lines whose errors are above those elsewhere.
+    if nowhere inside the errors of the paths stand out.
     """
     with ProgressBar("bubbles", 100) as bar:
         found = bubble_search.find_bubbles(

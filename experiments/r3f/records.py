@@ -187,12 +187,12 @@ class LightFacts:
 
     @property
     def doubt(self) -> str:
-        """Why the object should not be trusted, empty where nothing speaks against it."""
+        """Warning that no model explains the object; empty if one does."""
         if self.after is None or self.after <= _DOUBTFUL:
             return ""
         return (
-            f"an error of {self.after:.4f} is left, so the object has something that no model here "
-            "has. Compare with straight rays: train --paths=straight"
+            f"an error of {self.after:.4f} is left, so no model here explains the object. Compare "
+            "with straight rays: train --paths=straight"
         )
 
 

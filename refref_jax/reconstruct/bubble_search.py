@@ -1,20 +1,20 @@
 """Finds bubbles of air in a solid glass object, from photographs of light refracted by it.
 
-Where a bubble is, every line of sight that passes it is wrong. So the errors of pixels are
-projected back along the segments of their main paths inside the object, as it was fitted without
-bubbles, and averaged in the cells of a coarse grid. Peaks of the mean error are where a bubble may
-be. The ball that best parts large errors from small ones there, its *shadow*, tells centre and
-radius without tracing light again. A few radii about it are looked at through a blurred backdrop,
-the best is improved by Gauss-Newton steps, with ever less blur, and held-out pixels whose paths
-pass it decide whether it is kept. Then the next one is looked for. At the end, all unknowns are
-fitted together.
+Every light path that passes a bubble predicts a wrong colour. So the errors of pixels are projected
+back along the segments of their main paths inside the object, as it was fitted without bubbles, and
+averaged in the cells of a coarse grid. Peaks of the mean error are where a bubble may be. The
+sphere there that best separates paths of large errors from those of small ones gives an initial
+centre and radius, without tracing light again. A few radii about it are tried with a blurred
+backdrop, the best is improved by Gauss-Newton steps, with ever less blur, and held-out pixels whose
+paths pass it decide whether it is kept. Then the search is repeated for the next one. At the end,
+all unknowns are fitted together.
 
-What this cannot find: bubbles that are no balls, or smaller than about a pixel; those in vessels,
-and inclusions that are not air; anything in front of a plain wall, where no path changes a colour.
+What this cannot find: bubbles that are not spherical, or smaller than about a pixel; those in
+vessels, and inclusions that are not air; anything in front of a plain wall.
 
 Sources: Kak and Slaney, Principles of Computerized Tomographic Imaging (1988), for back-projection;
-Otsu, A Threshold Selection Method from Gray-Level Histograms (1979), for what parts errors best.
-Back-projection along bent paths, and shadows of balls, are ours.
+Otsu, A Threshold Selection Method from Gray-Level Histograms (1979), for the best
+separation of errors. Back-projection along bent paths, and separation by spheres, are ours.
 """
 
 import dataclasses
@@ -47,7 +47,7 @@ _ABOVE, _LEVEL = 4.0, 1.0 / 255.0
 # Pixels belong to a bubble if their paths pass within this many radii of its middle.
 _NEAR, _JUDGED = 2.5, 1.3
 
-# Paths that may be in the shadow of a bubble pass a peak within this share of the diameter, and the
+# Paths that may pass a bubble pass its peak within this share of the diameter, and the
 # number of centres that are tried.
 _REACH, _EVALUATIONS = 0.12, 120
 
@@ -71,7 +71,7 @@ class BubbleSettings:
       rays: number of pixels that are projected back, and that steps draw from.
       cells: number of cells of the grid along the longest side of the object.
       peaks: number of peaks that are looked at for each bubble.
-      radii: radii that are looked at, as shares of that of the shadow.
+      radii: radii that are looked at, as shares of the initial one.
       blur: halvings of the resolution of the backdrop in looks.
       looked: largest number of pixels of a look.
       few: number of steps of one bubble without blur.
@@ -90,10 +90,10 @@ class BubbleSettings:
 
 
 class Peak(NamedTuple):
-    """A place inside an object that lines of sight with large errors pass.
+    """A place inside an object that paths with large errors pass.
 
     Attributes:
-      centre: world units.
+      centre: position, world units.
       error: mean robust error of the pixels whose paths pass, sRGB.
       level: median of the same over all places.
       scatter: usual scatter of the same between places.
@@ -194,7 +194,7 @@ class _Task(NamedTuple):
     ) -> tuple[float, Bubble] | None:
         """Returns the best of a few radii and its gain, `None` if none helps."""
         settings, size = self.settings, diameter(found.mesh.vertices)
-        guess = _shadow(segments, errors, peak.centre, _REACH * size)
+        guess = _best_sphere(segments, errors, peak.centre, _REACH * size)
         if not depth_inside(guess.centre, found.candidate.parts[0]).distance > 0.0:
             return None
         radii = [share * guess.radius for share in settings.radii]
@@ -282,7 +282,7 @@ def peaks(
     *,
     settings: BubbleSettings = BubbleSettings(),
 ) -> list[Peak]:
-    """Returns the places in an object where errors along all lines of sight are large.
+    """Returns the places in an object where errors along all paths are large.
 
     The error of each pixel is spread along its segments over the cells of a grid.
 
@@ -346,16 +346,16 @@ def _distances(
     return np.min(np.where(segments.inside, away, np.inf), axis=1).astype(np.float64)
 
 
-def _shadow(
+def _best_sphere(
     segments: InnerSegments,
     errors: Float[np.ndarray, " rays"],
     point: Float[np.ndarray, "3"],
     reach: float,
 ) -> Bubble:
-    """Returns the ball near a point that best parts paths of large errors from those of small.
+    """Returns the sphere near a point that best separates paths of large and of small errors.
 
-    A ball parts paths into those that pass it and the others. The best one leaves the least
-    variance of the errors in both sets, as Otsu's threshold does (1979).
+    A sphere separates paths that pass it from the others. The best one leaves the least variance of
+    the errors in both sets, as Otsu's threshold does (1979).
     """
     near = np.flatnonzero(_distances(segments, point) <= reach)
     if len(near) < 2:
@@ -363,7 +363,7 @@ def _shadow(
     some = InnerSegments(*(each[near] for each in segments))
     count = np.arange(1, len(near))
 
-    def parted(centre: Float[np.ndarray, "3"]) -> tuple[float, float]:
+    def separation(centre: Float[np.ndarray, "3"]) -> tuple[float, float]:
         away = _distances(some, centre)
         order = np.argsort(away)
         total = np.cumsum(errors[near][order])
@@ -374,5 +374,5 @@ def _shadow(
 
     simplex = point + 0.15 * reach * np.concatenate([np.zeros((1, 3)), np.eye(3)])
     options = {"initial_simplex": simplex, "maxfev": _EVALUATIONS, "xatol": 1e-3 * reach}
-    centre = minimize(lambda c: -parted(c)[0], point, method="Nelder-Mead", options=options).x
-    return Bubble(centre, parted(centre)[1])
+    centre = minimize(lambda c: -separation(c)[0], point, method="Nelder-Mead", options=options).x
+    return Bubble(centre, separation(centre)[1])

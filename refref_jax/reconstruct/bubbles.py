@@ -1,13 +1,13 @@
-"""Balls of air, or of another medium, inside a solid object, as unknowns of a fit.
+"""Spheres of air, or of another medium, inside a solid object, as unknowns of a fit.
 
-`ObjectWithBubbles` is a `gauss_newton.Model`: an object, and balls inside it. A ball that would
-reach through the surface, or into an earlier ball, is held inside: its centre moves away from the
-nearest obstacle until the smallest ball has room, and its radius shrinks until it fits.
+`ObjectWithBubbles` is a `gauss_newton.Model`: an object, and spheres inside it. A sphere that would
+reach through the surface, or into an earlier one, is held inside: its centre moves away from the
+nearest obstacle until the smallest bubble has room, and its radius shrinks until it fits.
 `bubble_search` finds out where bubbles are.
 
-What this cannot represent: bubbles that are no balls; those that touch each other or the surface
-(a small gap is left); bubbles in vessels. Where two obstacles are near the middle of a ball at the
-same time, only the nearer one holds it.
+What this cannot represent: bubbles that are not spherical; those that touch each other or the
+surface (a small gap is left); bubbles in vessels. Where two obstacles are near the centre at the
+same time, only the nearer one counts.
 
 Source: ours.
 """
@@ -44,19 +44,19 @@ _SUBDIVISIONS, _PARTS = 4, 9
 
 
 class Bubble(NamedTuple):
-    """A ball.
+    """A spherical bubble.
 
     Attributes:
-      centre: world units.
-      radius: world units.
+      centre: position of its centre, world units.
+      radius: radius, world units.
     """
 
     centre: Float[np.ndarray, "3"]
     radius: float
 
 
-class _Ball(NamedTuple):
-    """Centre and radius that a ball has within its limits, and their derivatives."""
+class _Held(NamedTuple):
+    """Centre and radius of a bubble within its limits, and their derivatives."""
 
     values: Float[np.ndarray, "4"]
     by: scipy.sparse.csr_array
@@ -66,7 +66,7 @@ class Depth(NamedTuple):
     """How far a point is from the nearest obstacle.
 
     Attributes:
-      distance: world units; negative beyond the obstacle.
+      distance: distance, world units; negative beyond the obstacle.
       away: unit direction in which it grows.
       by_obstacle: derivatives of the depth by the unknowns of the obstacle.
       curvature: derivatives of the direction as the point moves across it, per world unit.
@@ -81,9 +81,9 @@ class Depth(NamedTuple):
 
 
 class ObjectWithBubbles:
-    """A solid object with balls of another medium inside.
+    """A solid object with spheres of another medium inside.
 
-    The unknowns are those of the object, then centre and radius of each ball, world units.
+    The unknowns are those of the object, then centre and radius of each bubble, world units.
 
     Example:
       >>> model = ObjectWithBubbles(trial.model, trial.fit.x, [Bubble(np.zeros(3), 0.1)])
@@ -93,7 +93,7 @@ class ObjectWithBubbles:
     Attributes:
       solid: model of the object, of one part.
       own: number of its unknowns.
-      index: index of refraction in the balls.
+      index: index of refraction in the bubbles.
     """
 
     def __init__(
@@ -104,7 +104,7 @@ class ObjectWithBubbles:
         *,
         index: float = INDEX_OF_AIR,
     ) -> None:
-        """Takes the object at rest, and the balls at rest.
+        """Takes the object at rest, and the bubbles at rest.
 
         Raises:
           ReconstructionError: if a radius is not positive, or a centre is not inside the object.
@@ -112,7 +112,7 @@ class ObjectWithBubbles:
         self.solid, self.own, self.index = solid, len(x), index
         self._at_rest = tuple(bubbles)
         self._rest = np.concatenate([x, *(np.append(each.centre, each.radius) for each in bubbles)])
-        self._ball = Sphere(np.zeros(3), 1.0, subdivisions=_SUBDIVISIONS)
+        self._unit_sphere = Sphere(np.zeros(3), 1.0, subdivisions=_SUBDIVISIONS)
         outer = solid.pose(x).parts[0]
         self._size = diameter(outer.vertices)
         for each in bubbles:
@@ -127,15 +127,15 @@ class ObjectWithBubbles:
         return self._rest.copy()
 
     def pose(self, x: Float[np.ndarray, " unknowns"]) -> Candidate:
-        """Returns the object and the balls within their limits."""
+        """Returns the object and the bubbles within their limits."""
         at_rest = self.solid.pose(x[: self.own])
         outer = at_rest.parts[0]
         outer = outer._replace(
             by_vertices=_widened(outer.by_vertices, len(x)),
             by_normals=_widened(outer.by_normals, len(x)),
         )
-        balls = [self._posed(ball) for ball in self._balls(x, outer)]
-        count = max(_PARTS, 1 + len(balls))
+        held = [self._posed(each) for each in self._limited_bubbles(x, outer)]
+        count = max(_PARTS, 1 + len(held))
         tint = np.asarray(at_rest.interfaces.tint, np.float64)[0].tolist()
         interfaces = nested(
             [self.solid.index_of(x[: self.own])] + [self.index] * (count - 1),
@@ -144,36 +144,36 @@ class ObjectWithBubbles:
         )
         tinted = 3 * count if at_rest.by_tints.shape[0] else 0
         return Candidate(
-            (outer, *balls),
+            (outer, *held),
             interfaces,
             _widened(at_rest.by_indices, len(x), rows=count),
             _widened(at_rest.by_tints, len(x), rows=tinted),
         )
 
-    def _posed(self, ball: _Ball) -> Posed:
-        posed = self._ball.pose(ball.values)
-        by_vertices = scipy.sparse.csr_array(posed.by_vertices) @ ball.by
-        nothing = scipy.sparse.csr_array((3 * len(posed.normals), ball.by.shape[1]))
+    def _posed(self, held: _Held) -> Posed:
+        posed = self._unit_sphere.pose(held.values)
+        by_vertices = scipy.sparse.csr_array(posed.by_vertices) @ held.by
+        nothing = scipy.sparse.csr_array((3 * len(posed.normals), held.by.shape[1]))
         return posed._replace(by_vertices=by_vertices, by_normals=nothing)
 
-    def _balls(self, x: Float[np.ndarray, " unknowns"], outer: Posed) -> list[_Ball]:
-        """Returns the balls within their limits, each apart from the surface and earlier ones."""
+    def _limited_bubbles(self, x: Float[np.ndarray, " unknowns"], outer: Posed) -> list[_Held]:
+        """Returns the bubbles within their limits, apart from the surface and from earlier ones."""
         least, gap = _LEAST * self._size, _GAP * self._size
-        found: list[_Ball] = []
+        found: list[_Held] = []
         for first in range(self.own, len(x), 4):
             by = scipy.sparse.eye_array(len(x)).tocsr()[first : first + 4]
             depths = [depth_inside(x[first : first + 3], outer)]
-            depths += [_depth_beside(x[first : first + 3], ball) for ball in found]
+            depths += [_depth_beside(x[first : first + 3], each) for each in found]
             tightest = min(depths, key=lambda depth: depth.distance)
             found.append(_limited(x[first : first + 4], by, tightest, least, gap))
         return found
 
     def bubbles(self, x: Float[np.ndarray, " unknowns"]) -> tuple[Bubble, ...]:
-        """Returns the balls within their limits."""
+        """Returns the bubbles within their limits."""
         outer = self.solid.pose(x[: self.own]).parts[0]
         outer = outer._replace(by_vertices=_widened(outer.by_vertices, len(x)))
-        balls = self._balls(x, outer)
-        return tuple(Bubble(ball.values[:3], float(ball.values[3])) for ball in balls)
+        held = self._limited_bubbles(x, outer)
+        return tuple(Bubble(each.values[:3], float(each.values[3])) for each in held)
 
     def index_of(self, x: Float[np.ndarray, " unknowns"]) -> float:
         """Returns the index of refraction of the glass."""
@@ -183,17 +183,17 @@ class ObjectWithBubbles:
         """Returns the parts, as those of an ordinary scene; `glass` contains the bubbles."""
         candidate = self.pose(x)
         red, green, blue = np.asarray(candidate.interfaces.tint, np.float64)[0].tolist()
-        outer, *balls = (mesh_of(part) for part in candidate.parts)
+        outer, *bubbles = (mesh_of(part) for part in candidate.parts)
         glass = Solid("glass", outer, self.index_of(x), NO_PARENT, (red, green, blue))
         return [glass] + [
-            Solid(f"bubble{number}", ball, self.index, 0, (1.0, 1.0, 1.0))
-            for number, ball in enumerate(balls, 1)
+            Solid(f"bubble{number}", bubble, self.index, 0, (1.0, 1.0, 1.0))
+            for number, bubble in enumerate(bubbles, 1)
         ]
 
     def prior(
         self, x: Float[np.ndarray, " unknowns"]
     ) -> tuple[Float[np.ndarray, "unknowns unknowns"], Float[np.ndarray, " unknowns"]]:
-        """Returns the prior of the object, and that of balls near those at rest."""
+        """Returns the prior of the object, and that of bubbles near those at rest."""
         precision, pull = self.solid.prior(x[: self.own])
         whole = np.zeros((len(x), len(x)))
         whole[: self.own, : self.own] = precision
@@ -204,7 +204,7 @@ class ObjectWithBubbles:
         return whole, np.concatenate([pull, weights * (x - self._rest)[self.own :]])
 
     def scales(self) -> Float[np.ndarray, " unknowns"]:
-        """Returns the scales of the object, and a quarter of the radius of each ball."""
+        """Returns the scales of the object, and a quarter of the radius of each bubble."""
         radii = np.array([each.radius for each in self._at_rest])
         return np.concatenate([self.solid.scales(), np.repeat(_STEPS * radii, 4)])
 
@@ -220,7 +220,7 @@ def depth_inside(point: Float[np.ndarray, "3"], outer: Posed) -> Depth:
     """Returns how deep a point is inside a surface.
 
     Args:
-      point: world units.
+      point: a point, world units.
       outer: a closed surface, and its derivatives by some unknowns.
 
     Returns:
@@ -248,14 +248,14 @@ def depth_inside(point: Float[np.ndarray, "3"], outer: Posed) -> Depth:
     return Depth(side * length, away, by)
 
 
-def _depth_beside(point: Float[np.ndarray, "3"], ball: _Ball) -> Depth:
-    """Returns how far a point is outside another ball."""
-    away = point - ball.values[:3]
+def _depth_beside(point: Float[np.ndarray, "3"], other: _Held) -> Depth:
+    """Returns how far a point is outside another bubble."""
+    away = point - other.values[:3]
     length = float(np.linalg.norm(away))
     away = away / length if length > 0.0 else np.array([1.0, 0.0, 0.0])
     row = scipy.sparse.csr_array(np.append(-away, -1.0)[None])
     curvature = 1.0 / length if length > 0.0 else 0.0
-    return Depth(length - float(ball.values[3]), away, row @ ball.by, curvature, ball.by[:3])
+    return Depth(length - float(other.values[3]), away, row @ other.by, curvature, other.by[:3])
 
 
 def _limited(
@@ -264,8 +264,8 @@ def _limited(
     depth: Depth,
     least: float,
     gap: float,
-) -> _Ball:
-    """Returns a ball that leaves a gap to an obstacle and has at least a radius."""
+) -> _Held:
+    """Returns a bubble that leaves a gap to an obstacle and has at least some radius."""
     centre, radius, away = values[:3], float(values[3]), depth.away[:, None]
     by_centre, by_radius = by[:3], by[3:]
     by_depth = scipy.sparse.csr_array(away.T) @ by_centre + depth.by_obstacle
@@ -282,4 +282,4 @@ def _limited(
     elif radius < least:
         radius, by_radius = least, 0.0 * by_radius
     whole = scipy.sparse.vstack([by_centre, by_radius]).tocsr()
-    return _Ball(np.append(centre, radius), whole)
+    return _Held(np.append(centre, radius), whole)

@@ -158,8 +158,8 @@ class InnerSegments(NamedTuple):
     """Segments of main paths, in order.
 
     Attributes:
-      starts: where they begin, world units.
-      ends: where they end.
+      starts: first points, world units.
+      ends: last points, world units.
       inside: whether a segment lies in the object; the other fields have no meaning elsewhere.
     """
 

@@ -63,3 +63,13 @@ def test_a_plane_that_meets_nothing_has_no_outline(plane):
         part.vertices, part.faces, origin=(0.0, 0.0, plane), axes=((1, 0, 0), (0, 1, 0))
     )
     assert len(loops) == (plane == 0.0)
+
+
+def test_a_part_that_the_plane_does_not_meet_leaves_the_cut_whole(tmp_path):
+    drop = trimesh.creation.icosphere(subdivisions=3, radius=0.1)
+    aside = make_part(drop.apply_translation(np.add(_CENTRE, (0.0, 0.5, 0.0))), index=1.333)
+    cut_open.write(tmp_path / "drop.png", [_ball(1.0, index=1.5), aside], [_ball(1.0, index=1.5)])
+    for column in (0, 1):
+        np.testing.assert_allclose(
+            _colour(tmp_path / "drop.png", column), (0.56, 0.67, 0.74), atol=0.01
+        )

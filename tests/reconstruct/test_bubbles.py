@@ -272,14 +272,14 @@ def _chords(count=6000):
     return photometry.InnerSegments(*ends, np.ones((count, 1), bool))
 
 
-def test_peaks_and_shadows_tell_a_ball_from_chords():
+def test_peaks_and_the_best_sphere_find_a_ball_from_chords():
     trial, segments = _perfect(), _chords()
     passes = bubble_search._distances(segments, _ONE.centre) <= _ONE.radius
     errors = np.where(passes, 0.1, 0.005)
     first, *_ = peaks(trial, segments, errors)
     assert np.linalg.norm(first.centre - _ONE.centre) < 0.08
     assert first.error > 0.05 and first.level < 0.02
-    ball = bubble_search._shadow(segments, errors, first.centre, 0.4)
+    ball = bubble_search._best_sphere(segments, errors, first.centre, 0.4)
     np.testing.assert_allclose(ball.centre, _ONE.centre, atol=0.01)
     assert ball.radius == pytest.approx(0.12, abs=0.005)
     # Even errors, and no segments at all, have no peak.
