@@ -24,9 +24,10 @@ _AIR, _GLASS = 1.05, 1.44
 # Largest share of light that a clear medium takes.
 _CLEAR = 0.05
 
-# Colours of glass, of clear liquids, and of the walls around air.
-_GLASS_COLOUR, _LIQUID_COLOUR, _WALL_COLOUR = (
-    np.array(colour) for colour in ((0.56, 0.67, 0.74), (0.45, 0.7, 0.95), (0.88, 0.92, 0.94))
+# Colours of glass, of clear liquids, of the walls around air, and of opaque parts.
+_GLASS_COLOUR, _LIQUID_COLOUR, _WALL_COLOUR, _OPAQUE_COLOUR = (
+    np.array(colour)
+    for colour in ((0.56, 0.67, 0.74), (0.45, 0.7, 0.95), (0.88, 0.92, 0.94), (0.42, 0.38, 0.36))
 )
 
 
@@ -34,7 +35,8 @@ def write(path: Path, parts: Sequence[MeshPart], truth: Sequence[MeshPart] = ())
     """Writes a figure of an object: cut open, and its cross-section.
 
     The half that is nearer to the camera is removed. Cut glass is grey, a cut liquid has the colour
-    of light that went through a unit of it, and where there is air its walls are seen.
+    of light that went through a unit of it, opaque parts are brown, and where there is air its
+    walls are seen.
 
     Args:
       path: file to write.
@@ -97,8 +99,8 @@ def _draw_cut(axis: pyplot.Axes, parts: Sequence[MeshPart], middle: Float[np.nda
         )
     )
     for number, part in enumerate(parts):
-        if part.index >= _AIR:
-            holes = parts[number + 1 :] if number == 0 else ()
+        if part.index >= _AIR or _is_opaque(part):
+            holes = [each for each in parts[number + 1 :] if number == 0 and not _is_opaque(each)]
             _fill(axis, part, holes, middle)
     axis.set_aspect("equal")
     axis.autoscale_view()
@@ -137,8 +139,14 @@ def _in_camera(
     return np.stack([x, cosine * z + sine * y, sine * z - cosine * y], axis=-1)
 
 
+def _is_opaque(part: MeshPart) -> bool:
+    return part.material.kind == "opaque"
+
+
 def _cut_colour(part: MeshPart) -> Float[np.ndarray, "3"]:
     """Returns the colour of a cut."""
+    if _is_opaque(part):
+        return _OPAQUE_COLOUR
     left = np.asarray(part.tint, float) ** 2 * np.exp(-np.asarray(part.absorption, float))
     base = _GLASS_COLOUR if part.index >= _GLASS else _LIQUID_COLOUR
     clear = np.allclose(left, 1.0, atol=_CLEAR)
@@ -146,4 +154,6 @@ def _cut_colour(part: MeshPart) -> Float[np.ndarray, "3"]:
 
 
 def _surface_colour(part: MeshPart) -> Float[np.ndarray, "3"]:
+    if _is_opaque(part):
+        return _OPAQUE_COLOUR
     return _WALL_COLOUR if part.index < _AIR or part.index >= _GLASS else _cut_colour(part)

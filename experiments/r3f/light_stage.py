@@ -7,7 +7,8 @@ Families of shapes and a free surface are fitted to pixels of the training views
 index (`reconstruct.shape_from_refraction`). If the object is a body of revolution, and no solid
 glass explains its pixels, the stage looks at what may be inside instead of a free surface
 (`reconstruct.interior_search`). In a solid that was chosen, it looks for bubbles of air
-(`reconstruct.bubble_search`). Vessels and solids with bubbles become several parts. Pixels that
+(`reconstruct.bubble_search`). Vessels and solids with bubbles become several parts. Opaque caps and
+feet of bodies of revolution are parts of their own (`reconstruct.opaque_ends`). Pixels that
 were not fitted judge: those of the validation views, or of every eighth training view where these
 have no masks. Where the background is a field, and where light explains nothing better, the surface
 stays as it is.
@@ -19,29 +20,26 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
-from scipy.spatial import KDTree
+from jaxtyping import Float
 
 from experiments.cli.progress import ProgressBar
-from experiments.figures.style import pyplot
-from experiments.r3f import index_stage
+from experiments.r3f import index_stage, light_figures
 from experiments.r3f.records import IndexFacts, LightFacts, PartFacts, TrialFacts
 from refref_jax import atomic_files
-from refref_jax.choices import Split
+from refref_jax.choices import CLEAR, Split
 from refref_jax.data import meshes, scene_folder
-from refref_jax.data.scene_folder import Frames
-from refref_jax.geometry.cameras import image_rays
-from refref_jax.geometry.surfaces import pack_meshes
+from refref_jax.geometry.rays import Rays
 from refref_jax.geometry.triangle_meshes import Mesh, face_vectors, volume
+from refref_jax.optics.interface_rules import NO_PARENT
+from refref_jax.optics.media import INDEX_OF_AIR
 from refref_jax.reconstruct import (
     ReconstructionError,
     bubble_search,
     families,
-    gauss_newton,
     interior_looks,
     interior_search,
     model_selection,
-    photometry,
+    opaque_ends,
     shape_from_refraction,
 )
 from refref_jax.reconstruct.bubbles import ObjectWithBubbles
@@ -51,10 +49,10 @@ from refref_jax.reconstruct.interior_search import Finding
 from refref_jax.reconstruct.interiors import Solid, Vessel
 from refref_jax.reconstruct.masks import Views
 from refref_jax.reconstruct.model_selection import Trial
+from refref_jax.reconstruct.opaque_ends import OpaqueEnd
 from refref_jax.reconstruct.outlines import Outlines
 from refref_jax.reconstruct.photometry import Backdrop, Photographs
 from refref_jax.reconstruct.refinement import objection
-from refref_jax.render.images import find_first_surface
 
 FOLDER = "light"
 
@@ -82,9 +80,6 @@ _VOLUME_CHANGE = 0.02
 # Standard deviation of how much too wide all masks are, pixels.
 _WIDER = 0.5
 
-# Rows of the figure, and largest error and deviation that it distinguishes, in sRGB and degrees.
-_ROWS, _MOST_ERROR, _MOST_DEVIATION = 3, 0.2, 0.5
-
 # Deviation of normals beyond which light has not determined them, degrees.
 _UNKNOWN = 0.5
 
@@ -101,6 +96,24 @@ class Seen(NamedTuple):
     fitted: Photographs
     judges: Photographs
     split: Split
+
+
+class Revolved(NamedTuple):
+    """The object as a body of revolution.
+
+    Attributes:
+      outer: its outer surface; `None` if it is no such body.
+      ends: its opaque ends.
+    """
+
+    outer: Revolution | None
+    ends: tuple[OpaqueEnd, ...] = ()
+
+    def ends_seen(self, rays: Rays) -> Float[np.ndarray, "rays 3"]:
+        """Returns the linear RGB of the opaque end that each ray meets first, NaN without any."""
+        if self.outer is None or not self.ends:
+            return np.full((rays.radii.size, 3), np.nan)
+        return opaque_ends.colours_seen(self.outer, self.ends, rays)
 
 
 def run(
@@ -120,18 +133,22 @@ def run(
         reason = "the background is a field, not a surface at a known place"
         return LightFacts(kept=False, index=known.index, remark=reason)
     seen = read(scene, seed=seed)
-    trials = fit(scene, mesh, known, surface, seen, seed=seed)
+    revolved = look_at_ends(mesh, surface, seen, seed=seed)
+    trials = fit(scene, mesh, known, surface, seen, revolved, seed=seed)
     masks, chosen, remark = choose(scene, mesh, trials)
     kept = chosen is not masks
     deviations = model_selection.normal_deviations(chosen) if kept else None
     parts: tuple[PartFacts, ...] = ()
     with atomic_files.written_folder(target.parent) as folder:
         if kept and isinstance(chosen.model, Vessel | ObjectWithBubbles):
-            solids = chosen.model.solids(chosen.fit.x)
+            solids = [*chosen.model.solids(chosen.fit.x), *_solid_ends(revolved)]
             parts = _write_parts(folder, target.stem, solids, known)
         elif kept:
             meshes.write_mesh(folder / target.name, *chosen.mesh)
-        draw(folder / FIGURE, scene, seen.split, masks, chosen, surface, deviations)
+        views = (scene, seen.split)
+        light_figures.draw(
+            folder / FIGURE, *views, masks, chosen, surface, deviations, revolved.ends_seen
+        )
     unknown = 1.0 if deviations is None else float(np.mean(deviations > _UNKNOWN))
     estimated = known.source == "estimated"
     return LightFacts(
@@ -190,12 +207,23 @@ def _write_parts(
     facts, name = [], stem.rsplit("_", 1)[0]
     for solid in solids:
         material = min(_MATERIALS, key=lambda each: abs(each[1] - solid.index))[0]
+        material = material if solid.radiance is None else "opaque"
         file = f"{name}_{solid.name}_{material}.ply"
         meshes.write_mesh(folder / file, *solid.mesh)
         given = known.source == "given" and solid.name == "glass"
         index = known.index if given else solid.index
-        facts.append(PartFacts(file, index, solid.tint, solid.absorption))
+        facts.append(PartFacts(file, index, solid.tint, solid.absorption, solid.radiance))
     return tuple(facts)
+
+
+def _solid_ends(revolved: Revolved) -> list[Solid]:
+    """Returns the opaque ends as parts."""
+    found = []
+    for end in revolved.ends if revolved.outer is not None else ():
+        mesh = opaque_ends.mesh_of_end(revolved.outer, end)
+        name = "cap" if end.high >= revolved.outer.points[:, 1].max() else "foot"
+        found.append(Solid(name, mesh, INDEX_OF_AIR, NO_PARENT, CLEAR, radiance=end.colour))
+    return found
 
 
 def read(scene: Path, *, seed: int) -> Seen:
@@ -215,12 +243,28 @@ def read(scene: Path, *, seed: int) -> Seen:
     return Seen(fitted.chosen(np.flatnonzero(~held)), fitted.chosen(some), "train")
 
 
+def look_at_ends(mesh: Mesh, surface: Backdrop, seen: Seen, *, seed: int) -> Revolved:
+    """Returns the object as a body of revolution, if it is one, with its opaque ends."""
+    outer = families.fit_revolution(mesh, furthest=_FURTHEST)
+    if outer is None:
+        return Revolved(None)
+    return Revolved(outer, opaque_ends.find_opaque_ends(outer, surface, seen.fitted, seed=seed))
+
+
 def fit(
-    scene: Path, mesh: Mesh, known: IndexFacts, surface: Backdrop, seen: Seen, *, seed: int
+    scene: Path,
+    mesh: Mesh,
+    known: IndexFacts,
+    surface: Backdrop,
+    seen: Seen,
+    revolved: Revolved,
+    *,
+    seed: int,
 ) -> tuple[Trial, ...]:
     """Fits vessels, or else all shapes that come near the mesh; the mesh itself comes first.
 
     If bubbles are found in the shape that is chosen, it comes once more with them, as the last.
+    Pixels that see an opaque end do not count.
 
     Args:
       scene: folder of the scene.
@@ -228,11 +272,12 @@ def fit(
       known: index of refraction.
       surface: backdrop.
       seen: pixels to fit, and those that judge.
+      revolved: the object as a body of revolution (`look_at_ends`).
       seed: random seed.
     """
     frames = scene_folder.read_frames(scene, "train")
     views = Views(scene_folder.read_masks(frames), frames.cameras)
-    outer = families.fit_revolution(mesh, furthest=_FURTHEST)
+    outer, seen = _between_ends(revolved, seen)
     options = {} if known.source == "estimated" else {"deviation": 0.0}
     with ProgressBar("light", 100) as bar:
         trials = shape_from_refraction.fit_shapes(
@@ -255,6 +300,17 @@ def fit(
         return trials
     outlines = Outlines(views, common=_WIDER, seed=seed)
     return (*trials, *_with_bubbles(chosen, surface, seen, outlines, seed=seed))
+
+
+def _between_ends(revolved: Revolved, seen: Seen) -> tuple[Revolution | None, Seen]:
+    """Returns the clear part of a body, and the pixels that do not see its opaque ends."""
+    if revolved.outer is None or not revolved.ends:
+        return revolved.outer, seen
+    fitted, judges = (
+        each.chosen(np.flatnonzero(~opaque_ends.seen_by(revolved.outer, revolved.ends, each)))
+        for each in (seen.fitted, seen.judges)
+    )
+    return opaque_ends.remaining(revolved.outer, revolved.ends), Seen(fitted, judges, seen.split)
 
 
 def _with_bubbles(
@@ -349,101 +405,3 @@ def _facts(trial: Trial, best: Trial) -> TrialFacts:
         trial.index_deviation,
         trial.fit.taken,
     )
-
-
-def draw(
-    path: Path,
-    scene: Path,
-    split: Split,
-    before: Trial,
-    after: Trial,
-    surface: Backdrop,
-    deviations: Float[np.ndarray, " normals"] | None,
-) -> None:
-    """Draws views: the photograph, what both surfaces predict, their errors, and the uncertainty.
-
-    Args:
-      path: file to write.
-      scene: folder of the scene.
-      split: split of the views.
-      before: the surface from masks.
-      after: the chosen one.
-      surface: backdrop.
-      deviations: standard deviation of each normal of the chosen surface, degrees; `None` if light
-        has not determined them.
-    """
-    frames = scene_folder.read_frames(scene, split)
-    count = len(frames.names)
-    chosen = np.unique(np.linspace(0, count - 1, min(_ROWS, count)).astype(int))
-    masks, images = scene_folder.read_masks(frames), scene_folder.read_images(frames)
-    titles = ("photograph", "from masks", "by light", "error before", "error after", "normals ±")
-    figure, axes = pyplot.subplots(
-        len(chosen),
-        len(titles),
-        figsize=(12.5, 2.1 * len(chosen) + 0.3),
-        squeeze=False,
-        layout="constrained",
-    )
-    for axis in axes.flat:
-        axis.axis("off")
-    for axis, title in zip(axes[0], titles, strict=True):
-        axis.set_title(title, fontsize=9)
-    shown = None
-    for row, view in zip(axes, chosen, strict=True):
-        panels = _panels(frames, int(view), images[view], masks[view], (before, after), surface)
-        for axis, panel in zip(row[:3], panels[:3], strict=True):
-            axis.imshow(panel)
-        for axis, panel in zip(row[3:5], panels[3:], strict=True):
-            errors = axis.imshow(panel, vmin=0.0, vmax=_MOST_ERROR, cmap="magma")
-        seen = _seen_deviations(frames, int(view), after, deviations)
-        shown = row[5].imshow(seen, vmin=0.0, vmax=_MOST_DEVIATION, cmap="viridis")
-    figure.colorbar(errors, ax=axes[:, 3:5], label="sRGB", shrink=0.8, aspect=40, pad=0.01)
-    figure.colorbar(shown, ax=axes[:, 5], label="degrees", shrink=0.8, aspect=40, pad=0.01)
-    figure.savefig(path, dpi=110)
-    pyplot.close(figure)
-
-
-def _panels(
-    frames: Frames,
-    view: int,
-    image: UInt8[np.ndarray, "h w 3"],
-    mask: Bool[np.ndarray, "h w"],
-    trials: Sequence[Trial],
-    surface: Backdrop,
-) -> list[np.ndarray]:
-    """Returns the photograph, the predictions, and their errors within the mask."""
-    rays = image_rays(frames.cameras, view)
-    flat = rays._replace(**{k: getattr(rays, k).reshape(-1, *s) for k, s in _SHAPES.items()})
-    photograph = image.astype(np.float64) / 255.0
-    predicted = []
-    for trial in trials:
-        traced = gauss_newton.traced_object(trial.model.pose(trial.fit.x))
-        linear = photometry.predict(traced, surface, flat).linear
-        predicted.append(photometry.encode(linear).reshape(photograph.shape))
-    errors = [
-        np.where(mask, np.sqrt(np.mean((each - photograph) ** 2, axis=-1)), np.nan)
-        for each in predicted
-    ]
-    return [photograph, *predicted, *errors]
-
-
-_SHAPES = {"origins": (3,), "directions": (3,), "radii": ()}
-
-
-def _seen_deviations(
-    frames: Frames, view: int, trial: Trial, deviations: Float[np.ndarray, " normals"] | None
-) -> Float[np.ndarray, "h w"]:
-    """Returns the deviation of the normal that each pixel sees, NaN beside the object."""
-    rays = image_rays(frames.cameras, view)
-    first = find_first_surface(pack_meshes([trial.mesh]), rays)
-    seen = np.full(first.distances.shape, np.nan)
-    hit = np.isfinite(first.distances)
-    if deviations is None or not hit.any():
-        return seen
-    part = trial.model.pose(trial.fit.x).parts[0]
-    of_vertices = np.zeros(len(part.vertices))
-    of_vertices[part.faces.ravel()] = deviations[part.normal_ids.ravel()]
-    reach = np.where(hit, first.distances, 0.0)[..., None]
-    points = (rays.origins + reach * rays.directions)[hit]
-    seen[hit] = of_vertices[KDTree(part.vertices).query(points)[1]]
-    return seen

@@ -10,6 +10,7 @@ from pathlib import Path
 from experiments.r3f import geometry_stage, light_stage
 from experiments.r3f.records import IndexFacts, PartFacts, Reconstruction
 from refref_jax import configuration
+from refref_jax.choices import Material
 from refref_jax.data import meshes
 from refref_jax.data.meshes import MeshPart
 from refref_jax.data.scene_assembly import shaded_mesh
@@ -81,6 +82,10 @@ def read_parts(out: Path, found: Reconstruction) -> list[MeshPart]:
 
 def _read(folder: Path, facts: PartFacts) -> MeshPart:
     part = meshes.read_part(folder / facts.mesh, index=facts.index)
+    if facts.radiance is not None:
+        material = Material("opaque", radiance=facts.radiance)
+        radiance = meshes.read_radiance(material, part.faces, path=folder / facts.mesh)
+        return part._replace(material=material, radiance=radiance)
     if facts.tint is None:
         return part
     return part._replace(tint=facts.tint, absorption=facts.absorption, colour_known=True)

@@ -142,12 +142,14 @@ class PartFacts:
       index: index of refraction inside.
       tint: factor of linear RGB light at every crossing of its surface; `None` if unknown.
       absorption: absorption inside, linear RGB, per world unit.
+      radiance: linear RGB radiance of an opaque part, `None` for a clear one.
     """
 
     mesh: str
     index: float
     tint: tuple[float, float, float] | None = None
     absorption: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    radiance: tuple[float, float, float] | None = None
 
 
 @dataclasses.dataclass(frozen=True)

@@ -260,7 +260,8 @@ def _table(out: Path, found: Reconstruction, facts: ReportFacts) -> str:
         ),
     ]
     for part in found.light.parts[1:] if found.light is not None else ():
-        rows.append((f"inside: [{part.mesh}](light/{part.mesh})", _of_inside(part)))
+        where = "inside" if part.radiance is None else "opaque"
+        rows.append((f"{where}: [{part.mesh}](light/{part.mesh})", _of_inside(part)))
     if found.light is not None and found.light.before is not None:
         light = found.light
         after = f"{light.after:.4f} as a {light.shape}" if light.kept else "not refined"
@@ -284,6 +285,8 @@ def _of_inside(part: PartFacts) -> str:
     def numbers(colour: tuple[float, ...]) -> str:
         return " ".join(f"{channel:.3f}" for channel in colour)
 
+    if part.radiance is not None:
+        return f"radiance {numbers(part.radiance)}, linear RGB"
     tint = "" if part.tint is None else f", tint {numbers(part.tint)}"
     absorbs = f", absorption {numbers(part.absorption)} per unit" * any(part.absorption)
     return f"index {part.index:.4f}{tint}{absorbs}"
@@ -343,7 +346,7 @@ def _inside(found: Reconstruction) -> list[str]:
         return []
     return [
         f"## Inside\n\nThe object is a {found.light.shape}. Its nearer half is removed. Cut glass "
-        "is grey; where there is air its walls are seen.",
+        "is grey, opaque parts are brown; where there is air its walls are seen.",
         f"![The object, cut open]({FOLDER}/{_INSIDE})",
     ]
 

@@ -42,6 +42,9 @@ class Interior:
       contents: what is inside.
       mouth: whether the vessel is open.
       wall: distance of the inner from the outer wall at rest, world units.
+      base: least height of the inside above the lowest point of the axis, at rest, world units.
+      punt: height of the hollow under the bottom at rest, world units.
+      lid: least depth of the inside below the highest point of the axis, likewise.
       level: height of the liquid's surface above the point of the axis, world units.
       gap: height of the glass between liquid and air, world units.
       glass: index of refraction of the glass.
@@ -55,6 +58,9 @@ class Interior:
     contents: Contents = "liquid and air"
     mouth: bool = False
     wall: float = 0.1
+    base: float = 0.0
+    punt: float = 0.0
+    lid: float = 0.0
     level: float = 0.0
     gap: float = 0.01
     glass: float = 1.5

@@ -13,6 +13,7 @@ Source: ours.
 """
 
 import dataclasses
+import math
 import operator
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -40,9 +41,13 @@ from refref_jax.reconstruct.photometry import Backdrop, Photographs
 # Share of the pixels of largest derivatives that a step leaves out: interiors have many surfaces.
 _OUTLIERS = 0.02
 
-# Levels and gaps that are looked at again, as shares of the height, and the blur of these looks.
-_SHIFTS = (0.0, 0.03, -0.03, 0.05, -0.05, 0.08, -0.08, 0.12, -0.12)
-_GAPS, _BLUR = (0.001, 0.004, 0.01, 0.02, 0.03, 0.045, 0.06, 0.08, 0.1), 2
+# Levels, gaps, bases, lids and punts that are looked at again, as shares of the height, and the
+# blur of these looks.
+_SHIFTS = (0.03, -0.03, 0.05, -0.05, 0.08, -0.08, 0.12, -0.12)
+_GAPS = (0.001, 0.004, 0.01, 0.02, 0.03, 0.045, 0.06, 0.08, 0.1)
+_BASES = (0.03, 0.05, 0.07, 0.1, 0.14, 0.2, 0.28, 0.36, 0.45, 0.55)
+_LIDS, _PUNTS = (0.03, 0.05, 0.08, 0.12, 0.17, 0.24), (0.006, 0.012, 0.02, 0.03, 0.045)
+_BLUR = 2
 
 
 class Finding(NamedTuple):
@@ -262,29 +267,30 @@ def _looked_again(
     pixels: Photographs,
     settings: SearchSettings,
 ) -> list[Interior]:
-    """Returns the interiors of findings, with the level and the gap that suit them best.
+    """Returns the interiors of findings, with the level, gap, ends and punt that suit them best.
 
-    Steps move a level by little, and never open a mouth. So levels around that of a finding are
-    looked at, with each mouth, which only the fit of all unknowns can tell apart.
+    Steps move a level by little, never open a mouth, and do not fill a stem with glass. So numbers
+    around those of a finding are looked at, one kind after the other, with each mouth, which only
+    the fit of all unknowns can tell apart.
     """
     some = pixels.drawn(np.random.default_rng(settings.seed + 1), settings.pixels)
     blurred, size = photometry.blurred(surface, _BLUR), extent(outer)[0]
     kept: dict[str, Look] = {}
     for finding in findings:
         at = _with_wall(finding)
-        if not at.level_unknown:
-            kept.setdefault(at.name, Look(at, finding.error))
-            continue
-        for mouth in sorted({at.mouth, *settings.mouths}):
-            looks = looks_at(
-                _other_levels(dataclasses.replace(at, mouth=mouth), size), outer, blurred, some
-            )
-            if not looks:  # there is no mouth at its top
-                continue
-            again = _gaps_of(min(looks, key=_error).interior, size)
-            best = min(looks_at(again, outer, blurred, some), key=_error)
-            kept[best.interior.name] = min(kept.get(best.interior.name, best), best, key=_error)
-    return [each.interior for each in kept.values()]
+        ends_open = at.contents in ("air", "liquid and air")
+        for mouth in sorted({at.mouth, *settings.mouths}) if ends_open else [False]:
+            best = Look(dataclasses.replace(at, mouth=mouth), math.inf)
+            for variants in _VARIANTS:
+                others = variants(best.interior, size)
+                if others:
+                    again = [best.interior, *others]
+                    best = min(looks_at(again, outer, blurred, some), key=_error, default=best)
+            if best.error < math.inf:  # otherwise there is no mouth at its top
+                name = best.interior.name
+                kept[name] = min(kept.get(name, best), best, key=_error)
+    least = min(each.error for each in kept.values())
+    return [each.interior for each in kept.values() if each.error < settings.rivals * least]
 
 
 _error = operator.attrgetter("error")
@@ -292,20 +298,39 @@ _error = operator.attrgetter("error")
 
 def _other_levels(at: Interior, size: float) -> list[Interior]:
     """Returns the same with levels around its own."""
-    return [dataclasses.replace(at, level=at.level + shift * size) for shift in _SHIFTS]
+    shifts = _SHIFTS if at.level_unknown else ()
+    return [dataclasses.replace(at, level=at.level + shift * size) for shift in shifts]
 
 
-def _gaps_of(at: Interior, size: float) -> list[Interior]:
+def _other_gaps(at: Interior, size: float) -> list[Interior]:
     """Returns the same with other gaps.
 
     A thin gap does not show which way it should grow, so they begin at the level or end at the air.
     """
-    others = [
+    return [
         dataclasses.replace(at, gap=gap * size, level=at.level + shift)
-        for gap in _GAPS
+        for gap in (_GAPS if at.level_unknown else ())
         for shift in (0.0, at.gap - gap * size)
     ]
-    return [at, *others]
+
+
+def _other_bases(at: Interior, size: float) -> list[Interior]:
+    """Returns the same with thicker bases, such as the stem of a glass."""
+    return [dataclasses.replace(at, base=base * size) for base in _BASES if base * size > at.wall]
+
+
+def _other_punts(at: Interior, size: float) -> list[Interior]:
+    """Returns the same with hollows under its bottom."""
+    return [dataclasses.replace(at, punt=punt * size) for punt in _PUNTS]
+
+
+def _other_lids(at: Interior, size: float) -> list[Interior]:
+    """Returns the same with thicker lids, such as a stopper."""
+    lids = [lid * size for lid in _LIDS if lid * size > at.wall and not at.mouth]
+    return [dataclasses.replace(at, lid=lid) for lid in lids]
+
+
+_VARIANTS = (_other_levels, _other_gaps, _other_bases, _other_lids, _other_punts)
 
 
 def _best_of_kinds(findings: Sequence[Finding], settings: SearchSettings) -> list[Finding]:

@@ -44,6 +44,11 @@ _KNOTS, _INNER_KNOTS = 36, 28
 _ANGLE, _SHIFT = 0.02, 0.01
 _OFFSET, _BEND = 0.008, 0.004
 _INNER_OFFSET, _INNER_BEND = 0.03, 0.012
+
+# Ends of the outer wall may be hollow, which masks do not show: where its normal has at least this
+# share along the axis, deviations are larger by this factor.
+_LEVELLED, _HOLLOW = 0.9, 5.0
+
 _LEVEL, _GAP = 0.12, 0.04
 
 # The same of the indices of glass and liquid, of the logarithm of a tint, and of absorption along
@@ -86,6 +91,7 @@ class Solid:
       parent: part that contains it, or `NO_PARENT`.
       tint: factor on light at each crossing of its surface, linear RGB.
       absorption: absorption inside, linear RGB, per world unit.
+      radiance: linear RGB radiance of an opaque part, `None` for a clear one.
     """
 
     name: str
@@ -94,6 +100,7 @@ class Solid:
     parent: int
     tint: Colour
     absorption: Colour = NO_ABSORPTION
+    radiance: Colour | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -136,15 +143,18 @@ class Vessel:
         if outer.closed:
             raise ReconstructionError("A ring has no inside that the axis meets. Pass a vessel.")
         self.outer, self.interior_at_start, self.detail = outer, interior, detail
-        profile = Profile(outer.points, closed=False)
+        profile = walls.with_punt(Profile(outer.points, closed=False), interior.punt)
         self.size = _size(outer.points)
         self._outer = Wall(profile, points=detail.outer, knots=_KNOTS)
+        self._unseen = self._hollow_ends()
         self.layout = Layout(interior, _KNOTS, _INNER_KNOTS)
         if interior.contents != "none":
-            space = walls.inset(profile, interior.wall, self.size)
+            ends = {"base": interior.base, "lid": interior.lid}
+            space = walls.inset(profile, interior.wall, self.size, **ends)
             if space is None:
                 raise ReconstructionError(
-                    f"A wall of {interior.wall:g} leaves no space inside. Pass a thinner one."
+                    f"A wall of {interior.wall:g}, a base of {interior.base:g} and a lid of "
+                    f"{interior.lid:g} leave no space inside. Pass thinner ones."
                 )
             self._inner = Wall(space, points=detail.inner, knots=_INNER_KNOTS)
             self._rest = self._limits()
@@ -152,6 +162,15 @@ class Vessel:
                 self._rim = self._find_rim()
             self._range = self._heights()
         self._plan = self._shares()
+
+    def _hollow_ends(self) -> Float[np.ndarray, " knots"]:
+        """Returns the factors of the deviations of the outer wall's knots."""
+        at_knots = self._outer.directions[np.argmax(self._outer.hats, axis=0), 1]
+        count = len(at_knots)
+        first, last = np.flatnonzero(at_knots > -_LEVELLED), np.flatnonzero(at_knots < _LEVELLED)
+        bottom, top = first[0] if len(first) else 0, last[-1] + 1 if len(last) else count
+        number = np.arange(count)
+        return np.where((number < bottom) | (number >= top), _HOLLOW, 1.0)
 
     def _limits(self) -> tuple[Limits, Int[np.ndarray, " points"]]:
         """Returns the limits of the inner wall at rest, and the nearest points of the outer one."""
@@ -407,7 +426,7 @@ class Vessel:
         deviations = np.full(layout.count, _TINT)
         for where, deviation in (
             (layout.axis, np.array([_ANGLE, _ANGLE, _SHIFT * size, _SHIFT * size])),
-            (layout.outer, _OFFSET * size),
+            (layout.outer, _OFFSET * size * self._unseen),
             (layout.inner, _INNER_OFFSET * size),
             (layout.level, _LEVEL * size),
             (layout.gap, _GAP * size),
@@ -421,6 +440,8 @@ class Vessel:
             count = where.stop - where.start
             if count:
                 bends = np.diff(np.eye(count), 2, axis=0)
+                if where == layout.outer:
+                    bends /= np.maximum(self._unseen[:-2], self._unseen[2:])[:, None]
                 precision[where, where] += bends.T @ bends / (bend * size) ** 2
         away = x - self.start()
         away[layout.tint], away[layout.absorption] = x[layout.tint], x[layout.absorption]

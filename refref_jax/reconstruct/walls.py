@@ -30,6 +30,9 @@ _MARGIN = 4
 # Smoothing of a profile that was inset, and of the turns that attract points, in steps.
 _SMOOTHING, _TURNS = 3.0, 4.0
 
+# Steepest slope of the bottom of a body, and share of its radius that a hollow takes.
+_LEVEL_SLOPE, _HOLLOW = 0.35, 0.92
+
 # Circles of a horizontal surface, with its rim and its middle.
 _RINGS = 4
 
@@ -78,15 +81,15 @@ class Wall:
 
     def __init__(self, profile: Profile, *, points: int = 160, knots: int = 36) -> None:
         """Takes a profile that is not closed, and the sizes of the splines."""
-        even = _even(profile.points, _STEPS)
-        length = _lengths(even)
+        dense = even(profile.points, _STEPS)
+        length = _lengths(dense)
         self.length = float(length[-1])
-        self.at = places(even, points)
-        knot = places(even, knots)
+        self.at = places(dense, points)
+        knot = places(dense, knots)
         self.points = np.stack(
             [
-                CubicSpline(length, even[:, 0], bc_type="natural")(self.at),
-                CubicSpline(length, even[:, 1], bc_type="clamped")(self.at),
+                CubicSpline(length, dense[:, 0], bc_type="natural")(self.at),
+                CubicSpline(length, dense[:, 1], bc_type="clamped")(self.at),
             ],
             axis=-1,
         )
@@ -334,7 +337,9 @@ def places(points: Curve, count: int) -> Float[np.ndarray, " count"]:
     return np.interp(np.linspace(0.0, total[-1], count), total, length)
 
 
-def inset(profile: Profile, distance: float, size: float) -> Profile | None:
+def inset(
+    profile: Profile, distance: float, size: float, *, base: float = 0.0, lid: float = 0.0
+) -> Profile | None:
     """Returns the curve at a distance inside a profile that encloses the largest area.
 
     It is the contour of the distance from the profile, so it has no loops where the profile bends
@@ -344,6 +349,8 @@ def inset(profile: Profile, distance: float, size: float) -> Profile | None:
       profile: profile that begins and ends on the axis.
       distance: distance, world units.
       size: diameter of the object.
+      base: least height above the lowest point of the axis, world units.
+      lid: least depth below its highest point.
 
     Returns:
       The curve; `None` if nothing is further inside.
@@ -354,31 +361,55 @@ def inset(profile: Profile, distance: float, size: float) -> Profile | None:
     if profile.closed:
         raise ReconstructionError("A ring has no inside that the axis meets. Pass a vessel.")
     cell = size / _CELLS
-    even = _even(profile.points, 4 * _STEPS)
-    low, high = even[:, 1].min(), even[:, 1].max()
+    dense = even(profile.points, 4 * _STEPS)
+    low, high = dense[:, 1].min(), dense[:, 1].max()
     bottom = float(low) - _MARGIN * cell
     rows = int((high - bottom) / cell) + 2 * _MARGIN
-    columns = int(even[:, 0].max() / cell) + 2 * _MARGIN
+    columns = int(dense[:, 0].max() / cell) + 2 * _MARGIN
     row, column = np.mgrid[:rows, :columns]
     centres = np.stack([(column + 0.5) * cell, bottom + (row + 0.5) * cell], axis=-1)
-    away, nearest = KDTree(even).query(centres.reshape(-1, 2))
-    outwards = centres.reshape(-1, 2) - even[nearest]
-    normals = profile_normals(Profile(even, closed=False))[nearest]
+    away, nearest = KDTree(dense).query(centres.reshape(-1, 2))
+    outwards = centres.reshape(-1, 2) - dense[nearest]
+    normals = profile_normals(Profile(dense, closed=False))[nearest]
     depth = np.where(np.sum(outwards * normals, axis=-1) < 0.0, away, -away) - distance
+    heights = centres[..., 1].ravel()
+    between_ends = np.minimum(heights - dense[0, 1] - base, dense[-1, 1] - lid - heights)
+    depth = np.minimum(depth, between_ends)
     shares = np.clip(0.5 + depth / (8.0 * cell), 0.0, 1.0).reshape(rows, columns)
     if shares.max() < 0.6:
         return None
     found = outline(Section(shares, bottom, cell))
     if found is None or found.closed:
         return None
-    points = _even(found.points, _STEPS)
+    points = even(found.points, _STEPS)
     loop = np.concatenate([points, points[-2:0:-1] * [-1.0, 1.0]])
     points = gaussian_filter1d(loop, _SMOOTHING, axis=0, mode="wrap")[: len(points)]
     points[[0, -1], 0] = 0.0
     return Profile(points, closed=False)
 
 
-def _even(points: Curve, count: int) -> Float[np.ndarray, "count 2"]:
+def with_punt(profile: Profile, height: float) -> Profile:
+    """Returns a profile with a hollow under its bottom, shaped like a dome.
+
+    Masks do not show such a hollow, since no line of sight below the rim that a body stands on
+    misses the body.
+
+    Args:
+      profile: profile that begins and ends on the axis.
+      height: height of the hollow on the axis, world units.
+    """
+    points = profile.points.copy()
+    steep = np.diff(points[:, 1]) > _LEVEL_SLOPE * np.diff(points[:, 0])
+    last = int(np.argmax(steep)) if steep.any() else len(points) - 1
+    reach = _HOLLOW * points[last, 0]
+    if reach <= 0.0:
+        return profile
+    share = np.minimum(points[: last + 1, 0] / reach, 1.0)
+    points[: last + 1, 1] += height * (1.0 - share**2)
+    return Profile(points, profile.closed)
+
+
+def even(points: Curve, count: int) -> Float[np.ndarray, "count 2"]:
     """Returns a curve in even steps."""
     length = _lengths(points)
     ticks = np.linspace(0.0, length[-1], count)

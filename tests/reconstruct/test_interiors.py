@@ -2,8 +2,6 @@
 
 import dataclasses
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -11,17 +9,14 @@ from refref_jax.geometry.triangle_meshes import volume
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.reconstruct import ReconstructionError, gauss_newton, interior_looks, photometry
 from refref_jax.reconstruct.contents import Detail, Interior
-from refref_jax.reconstruct.families import Revolution, fit_revolution
+from refref_jax.reconstruct.families import Revolution
 from refref_jax.reconstruct.interior_looks import SearchSettings, hypotheses, look
 from refref_jax.reconstruct.interior_search import Few, _finding, _looked_again, _simplest
 from refref_jax.reconstruct.interiors import Vessel
 from refref_jax.reconstruct.mesh_distance import signed_distance
-from refref_jax.reconstruct.photometry import Backdrop, Photographs
 from refref_jax.reconstruct.revolution import Profile
-from refref_jax.reconstruct.walls import inset
-from refref_jax.render import backdrop, pixels
-from refref_jax.sampling.scene_bounds import Domain
-from tests.factories import lit_scenes, revolved
+from refref_jax.reconstruct.walls import inset, with_punt
+from tests.factories import revolved, vessels
 from tests.laws import posed_surfaces
 
 _TINY = Detail(outer=40, inner=56, azimuths=12)
@@ -42,12 +37,7 @@ _INTERIORS = {
 
 @pytest.fixture(scope="module")
 def body():
-    """A bottle, 2.6 high."""
-    knee = revolved.arc((0.75, -1.15), 0.15, -90, 0)
-    neck = revolved.arc((0.35, 1.2), 0.1, 0, 90)
-    shoulder = [[0.9, -0.2], [0.85, 0.1], [0.7, 0.35], [0.52, 0.55], [0.45, 0.75]]
-    profile = np.concatenate([[[0.0, -1.3]], knee, shoulder, neck, [[0.0, 1.3]]])
-    return fit_revolution(revolved.revolve(revolved.even(profile, 160), azimuths=64))
+    return vessels.bottle()
 
 
 @pytest.fixture(scope="module", params=list(_INTERIORS))
@@ -144,6 +134,27 @@ def test_an_inset_of_a_cylinder_is_a_smaller_one():
     assert inset(Profile(revolved.cylinder(), closed=False), 1.2, 2.0) is None
 
 
+def test_an_inset_keeps_away_from_both_ends():
+    profile = Profile(revolved.even(revolved.cylinder(), 200), closed=False)
+    found = inset(profile, 0.2, 2.0, base=0.7, lid=0.4)
+    assert found.points[:, 1].min() == pytest.approx(-0.3, abs=5e-3)
+    assert found.points[:, 1].max() == pytest.approx(0.6, abs=5e-3)
+    assert found.points[:, 0].max() == pytest.approx(0.8, abs=2e-3)
+    assert inset(profile, 0.2, 2.0, base=1.2, lid=0.9) is None
+
+
+def test_a_punt_is_a_hollow_under_the_bottom_alone():
+    profile = Profile(revolved.even(revolved.cylinder(), 400), closed=False)
+    found = with_punt(profile, 0.15).points
+    assert found[0] == pytest.approx([0.0, -0.85])
+    outer = found[:, 0] > 0.93
+    np.testing.assert_array_equal(found[outer], profile.points[outer])
+    assert found[:, 1].min() == -1.0  # it still stands on its rim
+    np.testing.assert_array_equal(with_punt(profile, 0.0).points, profile.points)
+    ball = np.stack([np.sin(np.linspace(0, np.pi, 99)), -np.cos(np.linspace(0, np.pi, 99))], -1)
+    assert np.abs(with_punt(Profile(ball, closed=False), 0.1).points - ball).max() <= 0.1
+
+
 def test_what_can_not_be_a_vessel_is_refused(body):
     with pytest.raises(ReconstructionError, match="thinner"):
         Vessel(body, Interior("air", wall=1.0), _TINY)
@@ -163,15 +174,7 @@ def test_hypotheses_begin_with_the_simplest(body):
 
 @pytest.fixture(scope="module")
 def surface():
-    """A sphere of smooth random radiance."""
-    side, random = 32, np.random.default_rng(0)
-    pyramid = backdrop.init(side, radiance=0.4)
-    levels = [
-        jnp.asarray(level + size * random.normal(size=level.shape), jnp.float32)
-        for level, size in zip(pyramid, (0.12, 0.12, 0.08, 0.04), strict=True)
-    ]
-    mips = backdrop.mipmap(tuple(jnp.maximum(level, -0.1) for level in levels), "bounded")
-    return Backdrop(Domain(8.0, "bounded"), mips, tuple(jnp.ones_like(mip) for mip in mips))
+    return vessels.smooth_backdrop()
 
 
 @pytest.fixture(scope="module")
@@ -185,13 +188,7 @@ def small_tiles():
 def photographs(body, surface, small_tiles):
     """Pixels of the flask, without noise."""
     del small_tiles
-    rays, views = lit_scenes.pixels(4096, reach=0.6)
-    vessel = Vessel(body, _FLASK, _SMALL)
-    seen = photometry.predict(
-        gauss_newton.traced_object(vessel.pose(vessel.start())), surface, rays
-    )
-    rgb = np.asarray(jnp.clip(pixels.linear_to_srgb(jnp.asarray(seen.linear)), 0.0, 1.0))
-    return Photographs(jax.device_get(rays), rgb.astype(np.float64), views)
+    return vessels.photographs(Vessel(body, _FLASK, _SMALL), surface)
 
 
 def test_a_look_finds_the_tint_and_prefers_the_truth(body, surface, photographs):
@@ -220,11 +217,7 @@ def test_level_index_and_tint_are_recovered(body, surface, photographs):
 
 def test_an_absorbing_liquid_is_told_from_a_tinted_surface(body, surface):
     wine = dataclasses.replace(_FLASK, tint=(1.0, 1.0, 1.0), absorption=(0.1, 1.2, 0.8))
-    rays, views = lit_scenes.pixels(4096, reach=0.6)
-    truth = Vessel(body, wine, _SMALL)
-    scene = gauss_newton.traced_object(truth.pose(truth.start()))
-    rgb = photometry.encode(photometry.predict(scene, surface, rays).linear)
-    seen = Photographs(jax.device_get(rays), rgb, views)
+    seen = vessels.photographs(Vessel(body, wine, _SMALL), surface)
     vessel = Vessel(body, dataclasses.replace(_FLASK, tint=(0.9, 0.5, 0.6)), _SMALL)
     layout = vessel.layout
     few = Few(vessel, vessel.start(), np.eye(layout.count)[:, layout.tint.start :])
@@ -262,6 +255,20 @@ def test_levels_are_looked_at_again_with_both_mouths(body, surface, photographs)
     never = dataclasses.replace(settings, mouths=(False,))
     (closed,) = _looked_again(body, [far], surface, photographs, never)
     assert not closed.mouth
+
+
+def test_bases_lids_and_punts_are_looked_at(body, surface, small_tiles):
+    del small_tiles
+    truth = Interior("air", wall=0.08, base=0.72, lid=0.3, punt=0.08)
+    seen = vessels.photographs(Vessel(body, truth, _SMALL), surface, reach=1.4)
+    vessel = Vessel(body, Interior("air", wall=0.08), _SMALL)
+    fit = gauss_newton.Fit(vessel.start(), np.eye(vessel.layout.count), ())
+    plain = _finding(vessel, fit, surface, seen)
+    settings = SearchSettings(pixels=1200, mouths=(False,))
+    (found,) = _looked_again(body, [plain], surface, seen, settings)
+    assert found.base == pytest.approx(truth.base, abs=0.12)
+    assert found.lid == pytest.approx(truth.lid, abs=0.12)
+    assert found.punt == pytest.approx(truth.punt, abs=0.045)
 
 
 def test_looks_leave_out_walls_that_fill_the_vessel(body, surface, photographs):

@@ -14,6 +14,7 @@ from experiments.r3f import (
     chain,
     geometry_stage,
     index_stage,
+    light_figures,
     light_stage,
     object_source,
     records,
@@ -288,6 +289,8 @@ def _trial(name, mesh, index, errors):
     return Trial(name, SingleObject(FixedShape(mesh), index), fit, np.asarray(errors))
 
 
+_SHAPELESS = light_stage.Revolved(None)
+
 _VIEWS = 1e-3 * np.linspace(-1.0, 1.0, 5)
 
 
@@ -295,14 +298,15 @@ def _stub_light(monkeypatch, *, after, growth=1.001, index=1.51):
     """Replaces what learns and fits, which is tested elsewhere; returns what it is called with."""
     called = []
 
-    def fit(scene, mesh, known, surface, seen, *, seed):
+    def fit(scene, mesh, known, surface, seen, revolved, *, seed):
         called.append((known.index, surface, seen.split, seed))
         before = _trial("masks", mesh, known.index, 0.04 + _VIEWS)
         grown = mesh._replace(vertices=growth * mesh.vertices)
         return before, _trial("sphere", grown, index, after + _VIEWS)
 
     monkeypatch.setattr(light_stage, "fit", fit)
-    monkeypatch.setattr(light_stage, "draw", lambda path, *_: path.write_bytes(b"figure"))
+    monkeypatch.setattr(light_figures, "draw", lambda path, *_: path.write_bytes(b"figure"))
+    monkeypatch.setattr(light_stage, "look_at_ends", lambda *_, **options: _SHAPELESS)
     monkeypatch.setattr(index_stage, "learn_backdrop", lambda *_, **options: "surface")
     return called
 
@@ -394,7 +398,8 @@ def test_bubbles_come_with_the_shape_that_is_chosen(scene, monkeypatch, tmp_path
     # Few views see the bubble: by all of them, it is not significantly better.
     bubbly = Trial("ball with 1 bubble", model, fit, 0.0299 + _VIEWS)
     monkeypatch.setattr(light_stage, "fit", lambda *_, **options: (masks, solid, bubbly))
-    monkeypatch.setattr(light_stage, "draw", lambda path, *_: path.write_bytes(b"figure"))
+    monkeypatch.setattr(light_figures, "draw", lambda path, *_: path.write_bytes(b"figure"))
+    monkeypatch.setattr(light_stage, "look_at_ends", lambda *_, **options: _SHAPELESS)
     known, target = records.IndexFacts("estimated", 1.5, 0.01, 0.04), tmp_path / "a" / "b_glass.ply"
     facts = light_stage.run(scene, mesh, known, "surface", target, seed=0)
     if growth > 1.0:  # the shape was rejected, and its bubbles with it

@@ -1,0 +1,117 @@
+"""Opaque caps and feet: where they are, what is left, and what is no such end."""
+
+import numpy as np
+import pytest
+
+from refref_jax.geometry.triangle_meshes import volume
+from refref_jax.reconstruct import opaque_ends, photometry
+from refref_jax.reconstruct.families import Revolution
+from refref_jax.reconstruct.mesh_distance import signed_distance
+from refref_jax.reconstruct.opaque_ends import OpaqueEnd, find_opaque_ends, remaining
+from refref_jax.reconstruct.photometry import Backdrop
+from refref_jax.reconstruct.revolution import Profile
+from refref_jax.reconstruct.shape_from_refraction import SingleObject
+from refref_jax.reconstruct.shapes import FixedShape, mesh_of
+from tests.factories import revolved, vessels
+
+_BLUE, _ROW = (0.02, 0.05, 0.3), 2.6 / 128
+
+
+def _cap(body, height, colour=_BLUE):
+    top = float(body.points[:, 1].max())
+    return OpaqueEnd(top - height, top, colour)
+
+
+def _foot(body, height, colour=_BLUE):
+    bottom = float(body.points[:, 1].min())
+    return OpaqueEnd(bottom, bottom + height, colour)
+
+
+@pytest.fixture(scope="module")
+def body():
+    return vessels.bottle()
+
+
+@pytest.fixture(scope="module")
+def surface():
+    return vessels.smooth_backdrop()
+
+
+@pytest.fixture(scope="module")
+def clear(body, surface):
+    """Pixels of solid glass."""
+    model = SingleObject(FixedShape(mesh_of(body.pose(body.start()))), 1.5, deviation=1.0)
+    return vessels.photographs(model, surface, count=24_000, reach=1.4)
+
+
+def _painted(body, pixels, *ends):
+    """The same pixels where ends are opaque, with some noise."""
+    colours = opaque_ends.colours_seen(body, ends, pixels.rays)
+    seen = ~np.isnan(colours[:, 0])
+    rgb = pixels.rgb.copy()
+    rgb[seen] = photometry.encode(colours[seen])
+    noise = np.random.default_rng(0).normal(scale=0.01, size=rgb.shape)
+    return pixels._replace(rgb=np.clip(rgb + noise, 0.0, 1.0))
+
+
+def test_a_cap_is_found_where_it_is(body, surface, clear):
+    cap = _cap(body, 0.55)
+    (found,) = find_opaque_ends(body, surface, _painted(body, clear, cap))
+    assert found.low == pytest.approx(cap.low, abs=2.0 * _ROW)
+    assert found.high == pytest.approx(cap.high, abs=0.01)
+    assert found.colour == pytest.approx(_BLUE, abs=0.01)
+
+
+def test_a_cap_and_a_foot_are_two_ends(body, surface, clear):
+    ends = (_foot(body, 0.3, (0.5, 0.2, 0.1)), _cap(body, 0.4))
+    found = find_opaque_ends(body, surface, _painted(body, clear, *ends))
+    for end, true in zip(found, ends, strict=True):
+        assert (end.low, end.high) == pytest.approx((true.low, true.high), abs=2.0 * _ROW)
+        assert end.colour == pytest.approx(true.colour, abs=0.02)
+
+
+def test_clear_glass_has_no_opaque_ends(body, surface, clear):
+    assert find_opaque_ends(body, surface, _painted(body, clear)) == ()
+
+
+def test_in_front_of_a_plain_wall_nothing_is_told(body, surface, clear):
+    grey = Backdrop(
+        surface.domain, tuple(0.0 * mip + 0.4 for mip in surface.mips), surface.coverage
+    )
+    same = clear._replace(rgb=np.full_like(clear.rgb, 0.66))
+    assert find_opaque_ends(body, grey, same) == ()
+
+
+def test_what_is_opaque_as_a_whole_has_no_ends(body, surface, clear):
+    whole = OpaqueEnd(-4.0, 4.0, _BLUE)
+    assert find_opaque_ends(body, surface, _painted(body, clear, whole)) == ()
+    ring = Revolution(body.axis, Profile(revolved.ring(), closed=True), 2.0)
+    assert find_opaque_ends(ring, surface, clear) == ()
+
+
+def test_few_pixels_tell_nothing(body, surface, clear):
+    some = _painted(body, clear, _cap(body, 0.55)).chosen(np.arange(40))
+    assert find_opaque_ends(body, surface, some) == ()
+
+
+def test_glass_and_ends_are_apart_and_fill_the_body(body):
+    ends = (_foot(body, 0.3), _cap(body, 0.4))
+    glass = remaining(body, ends)
+    found = (glass.points[:, 1].min(), glass.points[:, 1].max())
+    assert found == pytest.approx((ends[0].high, ends[1].low), abs=0.02)
+    whole, middle = (mesh_of(each.pose(each.start())) for each in (body, glass))
+    meshes = [opaque_ends.mesh_of_end(body, end) for end in ends]
+    inside = signed_distance(middle)
+    for mesh in meshes:
+        assert volume(mesh.vertices, mesh.faces) > 0.0
+        assert inside(mesh.vertices).min() > 0.0
+    total = sum(volume(mesh.vertices, mesh.faces) for mesh in (middle, *meshes))
+    assert total == pytest.approx(volume(whole.vertices, whole.faces), rel=0.02)
+
+
+def test_pixels_of_ends_are_left_out(body, clear):
+    end = _cap(body, 0.55)
+    seen = opaque_ends.seen_by(body, (end,), clear)
+    painted = ~np.isnan(opaque_ends.colours_seen(body, (end,), clear.rays)[:, 0])
+    assert np.all(seen[painted])
+    assert not opaque_ends.seen_by(body, (OpaqueEnd(5.0, 6.0, _BLUE),), clear)[painted].any()
