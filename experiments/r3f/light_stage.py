@@ -141,7 +141,9 @@ def run(
     parts: tuple[PartFacts, ...] = ()
     with atomic_files.written_folder(target.parent) as folder:
         if kept and isinstance(chosen.model, Vessel | ObjectWithBubbles):
-            solids = [*chosen.model.solids(chosen.fit.x), *_solid_ends(revolved)]
+            solids = chosen.model.solids(chosen.fit.x)
+            if isinstance(chosen.model, Vessel):
+                solids += _solid_ends(revolved)
             parts = _write_parts(folder, target.stem, solids, known)
         elif kept:
             meshes.write_mesh(folder / target.name, *chosen.mesh)
@@ -218,10 +220,10 @@ def _write_parts(
 
 def _solid_ends(revolved: Revolved) -> list[Solid]:
     """Returns the opaque ends as parts."""
-    found = []
-    for end in revolved.ends if revolved.outer is not None else ():
-        mesh = opaque_ends.mesh_of_end(revolved.outer, end)
-        name = "cap" if end.high >= revolved.outer.points[:, 1].max() else "foot"
+    found, outer = [], revolved.outer
+    for end in revolved.ends if outer is not None else ():
+        mesh = opaque_ends.mesh_of_end(outer, end)
+        name = "cap" if end.low > outer.points[:, 1].mean() else "foot"
         found.append(Solid(name, mesh, INDEX_OF_AIR, NO_PARENT, CLEAR, radiance=end.colour))
     return found
 

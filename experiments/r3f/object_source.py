@@ -14,7 +14,7 @@ from refref_jax.choices import Material
 from refref_jax.data import meshes
 from refref_jax.data.meshes import MeshPart
 from refref_jax.data.scene_assembly import shaded_mesh
-from refref_jax.geometry.triangle_meshes import Mesh
+from refref_jax.geometry.triangle_meshes import Mesh, join
 
 _FILE = "body.json"
 
@@ -92,5 +92,9 @@ def _read(folder: Path, facts: PartFacts) -> MeshPart:
 
 
 def read_mesh(out: Path, found: Reconstruction) -> Mesh:
-    """Reads the surface; its vertices are in the order of the file's reader."""
-    return shaded_mesh(meshes.read_part(surface_file(out, found), index=1.0))
+    """Reads the outer surface and opaque parts; vertices are in the order of the file's reader."""
+    surface = shaded_mesh(meshes.read_part(surface_file(out, found), index=1.0))
+    parts = found.light.parts if _is_refined(found) else ()
+    opaque = [part for part in parts if part.radiance is not None]
+    others = [shaded_mesh(_read(out / light_stage.FOLDER, part)) for part in opaque]
+    return join([surface, *others]) if others else surface

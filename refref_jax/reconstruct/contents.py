@@ -78,7 +78,7 @@ class Interior:
     @property
     def name(self) -> str:
         """What is inside, in words."""
-        return self.contents + (", open" if self.mouth else "")
+        return self.contents + ", open" * self.mouth + ", stained" * self.stained
 
     @property
     def level_unknown(self) -> bool:

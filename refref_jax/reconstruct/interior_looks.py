@@ -9,6 +9,7 @@ Source: ours.
 
 import contextlib
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -24,6 +25,9 @@ from refref_jax.reconstruct.photometry import Backdrop, Photographs
 
 # Errors of a channel beyond this, in sRGB, do not grow while a tint is found.
 _CAP = 0.15
+
+# Error of stained glass, as a share of that of clear glass, below which its tint is worth while.
+_STAIN = 0.95
 
 # Logarithms of the tints tried, and the one that counts the crossings.
 _LOG_TINTS = np.linspace(0.05, -2.5, 103)
@@ -41,7 +45,7 @@ class SearchSettings:
       indices: indices of refraction of the liquid.
       glass: index of refraction of the glass.
       mouths: whether vessels may be closed, open, or both.
-      stained: whether the glass may have a tint.
+      stained: whether all glass may have a tint; otherwise that of vessels without liquid alone.
       blur: halvings of the backdrop's resolution in looks.
       pixels: number of pixels of a look.
       finalists: number of hypotheses of each kind that are improved.
@@ -208,10 +212,10 @@ def looks_at_all(
         raise ReconstructionError(
             "No wall leaves space inside the object. Pass smaller `thicknesses`."
         )
-    for variants in (_other_gaps, _other_indices, _other_mouths):
+    for variants in (_other_gaps, _other_indices, _other_mouths, _other_glass):
         best = _best_looks(looks, settings)
         others = [other for each in best for other in variants(each.interior, outer, settings)]
-        looks += looks_at(others, outer, blurred, some)
+        looks += _worth_their_tint(looks_at(others, outer, blurred, some), looks)
     return sorted(looks, key=lambda each: each.error)
 
 
@@ -248,9 +252,32 @@ def _other_mouths(at: Interior, outer: Revolution, settings: SearchSettings) -> 
     return [dataclasses.replace(at, mouth=True)] if fits else []
 
 
+def _other_glass(at: Interior, outer: Revolution, settings: SearchSettings) -> list[Interior]:
+    """Returns the same of stained glass, if there is no liquid, whose tint looks much the same."""
+    del outer, settings
+    return [] if at.filled or at.stained else [dataclasses.replace(at, stained=True)]
+
+
+def _worth_their_tint(looks: Sequence[Look], others: Sequence[Look]) -> list[Look]:
+    """Returns looks without those of stained glass that is hardly better than clear glass."""
+    least = {name: min(each.error for each in kind) for name, kind in _kinds(others).items()}
+
+    def is_worth(each: Look) -> bool:
+        clear = dataclasses.replace(each.interior, stained=False).name
+        return not each.interior.stained or each.error < _STAIN * least.get(clear, math.inf)
+
+    return [each for each in looks if is_worth(each)]
+
+
+def _kinds(looks: Sequence[Look]) -> dict[str, list[Look]]:
+    """Returns the looks of each kind, the best first."""
+    found: dict[str, list[Look]] = {}
+    for each in sorted(looks, key=lambda each: each.error):
+        found.setdefault(each.interior.name, []).append(each)
+    return found
+
+
 def _best_looks(looks: Sequence[Look], settings: SearchSettings) -> list[Look]:
     """Returns the best looks of each kind."""
-    names = sorted({each.interior.name for each in looks})
-    ordered = sorted(looks, key=lambda each: each.error)
-    kinds = [[each for each in ordered if each.interior.name == name] for name in names]
-    return [each for kind in kinds for each in kind[: settings.finalists]]
+    kinds = _kinds(looks)
+    return [each for name in sorted(kinds) for each in kinds[name][: settings.finalists]]

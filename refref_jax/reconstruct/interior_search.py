@@ -44,7 +44,7 @@ _OUTLIERS = 0.02
 # Levels, gaps, bases, lids and punts that are looked at again, as shares of the height, and the
 # blur of these looks.
 _SHIFTS = (0.03, -0.03, 0.05, -0.05, 0.08, -0.08, 0.12, -0.12)
-_GAPS = (0.001, 0.004, 0.01, 0.02, 0.03, 0.045, 0.06, 0.08, 0.1)
+_GAPS = (0.002, 0.008, 0.02, 0.04, 0.07, 0.1)
 _BASES = (0.03, 0.05, 0.07, 0.1, 0.14, 0.2, 0.28, 0.36, 0.45, 0.55)
 _LIDS, _PUNTS = (0.03, 0.05, 0.08, 0.12, 0.17, 0.24), (0.006, 0.012, 0.02, 0.03, 0.045)
 _BLUR = 2

@@ -276,3 +276,25 @@ def test_looks_leave_out_walls_that_fill_the_vessel(body, surface, photographs):
     found = interior_looks.looks_at_all(body, surface, photographs, settings)
     assert [each.error for each in found] == sorted(each.error for each in found)
     assert all(each.interior.wall == pytest.approx(0.13, abs=0.01) for each in found)
+
+
+@pytest.mark.parametrize("tint", [(1.0, 1.0, 1.0), (0.9, 0.97, 0.8)])
+def test_stained_glass_is_looked_at_where_it_pays(body, surface, small_tiles, tint):
+    del small_tiles
+    truth = Interior("air", wall=0.13, stained=True, glass_tint=tint)
+    seen = vessels.photographs(Vessel(body, truth, _SMALL), surface)
+    settings = SearchSettings((0.05,), 1, (0.04,), (1.36,), mouths=(False,), blur=1, pixels=800)
+    looks = interior_looks.looks_at_all(body, surface, seen, settings)
+    best = looks[0].interior
+    assert (best.contents, best.stained) == ("air", tint != (1.0, 1.0, 1.0))
+    assert best.glass_tint == pytest.approx(tint, abs=0.02)
+    assert any(each.interior.stained for each in looks) == best.stained
+
+
+def test_looks_tell_coloured_solid_glass_from_a_vessel(body, surface, small_tiles):
+    del small_tiles
+    solid = Interior("none", stained=True, glass_tint=(0.7, 0.9, 0.8))
+    seen = vessels.photographs(Vessel(body, solid, _SMALL), surface)
+    settings = SearchSettings((0.05,), 1, (0.04,), (1.36,), mouths=(False,), blur=1, pixels=800)
+    looks = interior_looks.looks_at_all(body, surface, seen, settings)
+    assert looks[0].interior.contents == "none"
