@@ -36,6 +36,7 @@ from refref_jax.reconstruct import (
     ReconstructionError,
     bubble_search,
     families,
+    free_vessels,
     interior_looks,
     interior_search,
     model_selection,
@@ -294,9 +295,11 @@ def fit(
             progress=lambda share, text: bar.show(round(100 * share), text),
             **options,
         )
+    outlines = Outlines(views, seed=seed)
     if _may_be_vessel(outer, trials):
-        outlines = Outlines(views, seed=seed)
         trials = (*trials, *_vessels(outer, known, surface, seen, outlines, seed=seed))
+    if _is_unexplained(trials) and not revolved.ends:
+        trials = (*trials, *_free_vessels(mesh, known, surface, seen, outlines, seed=seed))
     masks, chosen, _ = choose(scene, mesh, trials)
     if chosen is masks or isinstance(chosen.model, Vessel):
         return trials
@@ -338,9 +341,31 @@ def _with_bubbles(
 
 def _may_be_vessel(outer: Revolution | None, trials: Sequence[Trial]) -> bool:
     """Returns whether no solid shape explains the pixels of an object that may be a vessel."""
-    if outer is None or outer.closed:
-        return False
+    return outer is not None and not outer.closed and _is_unexplained(trials)
+
+
+def _is_unexplained(trials: Sequence[Trial]) -> bool:
     return min(trial.error for trial in trials) > _UNEXPLAINED
+
+
+def _free_vessels(
+    mesh: Mesh, known: IndexFacts, surface: Backdrop, seen: Seen, outlines: Outlines, *, seed: int
+) -> list[Trial]:
+    """Returns a vessel that is no body of revolution; none if no wall fits into the object."""
+    glass = {"glass": known.index} if known.source == "given" else {}
+    with ProgressBar("free vessel", 100) as bar:
+        found = free_vessels.fit_free_vessel(
+            mesh,
+            surface,
+            seen.fitted,
+            seen.judges,
+            outlines=outlines,
+            seed=seed,
+            progress=lambda share, text: bar.show(round(100 * share), text),
+            **glass,
+        )
+        bar.show(100, "done")
+    return [] if found is None else [found]
 
 
 def _vessels(

@@ -89,10 +89,10 @@ class Interior:
 class Layout:
     """Where the unknowns of a vessel are; slices, empty for what it does not have."""
 
-    def __init__(self, interior: Interior, outer: int, inner: int) -> None:
+    def __init__(self, interior: Interior, outer: int, inner: int, *, axis: int = 4) -> None:
         """Counts the unknowns."""
-        self.axis, self.outer = slice(0, 4), slice(4, 4 + outer)
-        at = 4 + outer
+        self.axis, self.outer = slice(0, axis), slice(axis, axis + outer)
+        at = axis + outer
 
         def take(count: int) -> slice:
             nonlocal at
@@ -101,7 +101,7 @@ class Layout:
 
         self.inner = take(inner if interior.contents != "none" else 0)
         self.level, self.gap = take(interior.level_unknown), take(interior.level_unknown)
-        self.profile = at - 4
+        self.profile = at - axis
         self.glass, self.liquid = take(1), take(interior.filled)
         self.tint, self.absorption = take(3 * interior.filled), take(3 * interior.filled)
         self.glass_tint = take(3 * interior.stained)

@@ -464,11 +464,11 @@ def _block_diagonal(blocks: Float[np.ndarray, "rays 3 3"]) -> scipy.sparse.csr_a
 
 def _by_channels(
     light: Float[np.ndarray, "rays 3"], counts: Num[np.ndarray, "rays parts"]
-) -> Float[np.ndarray, "values numbers"]:
+) -> scipy.sparse.csr_array:
     """Returns derivatives by numbers of each part and channel, such as the logarithms of tints."""
     rows, parts = counts.shape
     blocks = counts[:, None, :, None] * light[:, :, None, None] * np.eye(3)[None, :, None, :]
-    return blocks.reshape(3 * rows, 3 * parts)
+    return scipy.sparse.csr_array(blocks.reshape(3 * rows, 3 * parts))
 
 
 def _robust_weights(

@@ -276,8 +276,6 @@ class Vessel:
 
     def pose(self, x: Float[np.ndarray, " unknowns"]) -> Candidate:
         """Returns the vessel at given unknowns."""
-        zeros = len(x) - 4 - self.layout.profile
-        parts = [self._posed(outline, x, zeros) for outline in self._pieces(x)]
         kinds = self._kinds()
         kinds += ["air"] * (_PARTS - len(kinds))
         media = [self._media(x)[kind] for kind in kinds]
@@ -288,7 +286,7 @@ class Vessel:
             absorptions=[medium.absorption for medium in media],
         )
         return Candidate(
-            tuple(parts),
+            tuple(self._surfaces(x)),
             interfaces,
             _selected([medium.index_at for medium in media], 1, len(x)),
             _selected([medium.tint_at for medium in media], 3, len(x)),
@@ -313,6 +311,11 @@ class Vessel:
         inside = ["liquid"] if interior.filled else []
         air = interior.contents in ("air", "liquid and air") and not interior.mouth
         return ["glass", *inside, *(["air"] if air else [])]
+
+    def _surfaces(self, x: Float[np.ndarray, " unknowns"]) -> list[Posed]:
+        """Returns the surfaces of the parts, with columns for all unknowns."""
+        zeros = len(x) - 4 - self.layout.profile
+        return [self._posed(outline, x, zeros) for outline in self._pieces(x)]
 
     def _posed(self, outline: Outline, x: Float[np.ndarray, " unknowns"], zeros: int) -> Posed:
         """Returns a profile turned around the axis, with columns for all unknowns."""
@@ -430,9 +433,7 @@ class Vessel:
             (layout.inner, _INNER_OFFSET * size),
             (layout.level, _LEVEL * size),
             (layout.gap, _GAP * size),
-            (layout.glass, _GLASS),
-            (layout.liquid, _LIQUID),
-            (layout.absorption, _ABSORPTION / size),
+            *self._deviations_of_media(),
         ):
             deviations[where] = deviation
         precision = np.diag(deviations**-2.0)
@@ -443,16 +444,26 @@ class Vessel:
                 if where == layout.outer:
                     bends /= np.maximum(self._unseen[:-2], self._unseen[2:])[:, None]
                 precision[where, where] += bends.T @ bends / (bend * size) ** 2
+        return precision, precision @ self._away(x)
+
+    def _deviations_of_media(self) -> list[tuple[slice, float]]:
+        """Returns the standard deviations of indices and absorption."""
+        at = self.layout
+        absorbs = (at.absorption, _ABSORPTION / self.size)
+        return [(at.glass, _GLASS), (at.liquid, _LIQUID), absorbs]
+
+    def _away(self, x: Float[np.ndarray, " unknowns"]) -> Float[np.ndarray, " unknowns"]:
+        """Returns how far unknowns are from those that the prior expects: clear media."""
         away = x - self.start()
-        away[layout.tint], away[layout.absorption] = x[layout.tint], x[layout.absorption]
-        away[layout.glass_tint] = x[layout.glass_tint]
-        return precision, precision @ away
+        for clear in (self.layout.tint, self.layout.absorption, self.layout.glass_tint):
+            away[clear] = x[clear]
+        return away
 
     def scales(self) -> Float[np.ndarray, " unknowns"]:
         """Returns the largest change of each unknown in one step."""
         layout, size = self.layout, self.size
         found = np.full(layout.count, LARGEST_STEP * size)
-        found[:2] = LARGEST_TURN
+        found[layout.axis][:2] = LARGEST_TURN
         found[layout.inner] *= _INNER_STEPS
         found[layout.level] = found[layout.gap] = _LEVEL_STEP * size
         found[layout.glass] = found[layout.liquid] = _INDEX_STEP

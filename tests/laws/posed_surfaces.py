@@ -6,6 +6,14 @@ from refref_jax.geometry.triangle_meshes import face_normals, is_watertight, vol
 from refref_jax.reconstruct.shapes import mesh_of
 
 
+class PartOf:
+    """One part of a vessel as a surface that depends on unknowns."""
+
+    def __init__(self, vessel, number):
+        self.start, self.scales = vessel.start, vessel.scales
+        self.pose = lambda x: vessel.pose(x).parts[number]
+
+
 def assert_closed(posed):
     """The surface is closed, outward, and its normals are unit and on the side of the faces."""
     assert is_watertight(posed.faces)

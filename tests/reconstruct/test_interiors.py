@@ -45,14 +45,6 @@ def vessel(request, body):
     return Vessel(body, _INTERIORS[request.param], _TINY)
 
 
-class _Part:
-    """One part of a vessel as a surface that depends on unknowns."""
-
-    def __init__(self, vessel, number):
-        self.start, self.scales = vessel.start, vessel.scales
-        self.pose = lambda x: vessel.pose(x).parts[number]
-
-
 def _moved(vessel, seed, *, by=0.15):
     scales = vessel.scales()
     return vessel.start() + by * scales * np.random.default_rng(seed).normal(size=len(scales))
@@ -60,7 +52,9 @@ def _moved(vessel, seed, *, by=0.15):
 
 def test_derivatives_are_central_differences(vessel):
     for number in range(len(vessel.pose(vessel.start()).parts)):
-        posed_surfaces.assert_derivatives(_Part(vessel, number), step=1e-6, tolerance=1e-5)
+        posed_surfaces.assert_derivatives(
+            posed_surfaces.PartOf(vessel, number), step=1e-6, tolerance=1e-5
+        )
 
 
 def test_the_prior_is_quadratic(vessel):

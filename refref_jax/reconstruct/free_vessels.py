@@ -1,0 +1,220 @@
+"""Vessels of any shape that are full of air or of liquid: two free surfaces, as unknowns of a fit.
+
+The inner wall is a level set of the distance from the outer one, above a flat base. Both are free
+surfaces (`shapes.FreeSurface`). The inner one follows the outer one, so that the wall keeps its
+thickness where light says nothing, and has handles of its own besides, fewer.
+
+What this cannot represent: the surface of a liquid, and open mouths.
+
+Source: ours.
+"""
+
+import contextlib
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+import scipy.sparse
+from jaxtyping import Float
+from scipy.spatial import KDTree
+
+from refref_jax.geometry.triangle_meshes import Mesh, diameter
+from refref_jax.reconstruct import ReconstructionError, gauss_newton, photometry
+from refref_jax.reconstruct.contents import Interior, Layout
+from refref_jax.reconstruct.gauss_newton import Candidate, Fit, Rows, Steps
+from refref_jax.reconstruct.grids import Box, Grid, find_isosurface, sample
+from refref_jax.reconstruct.interiors import Vessel
+from refref_jax.reconstruct.mesh_distance import signed_distance
+from refref_jax.reconstruct.model_selection import Trial, judged
+from refref_jax.reconstruct.photometry import Backdrop, Photographs
+from refref_jax.reconstruct.shapes import FreeSurface, Posed
+
+# Distance between the points of the grid of distances, and between the handles of the inner wall,
+# as shares of the diameter.
+_SPACING, _INNER = 1.0 / 150.0, 1.0 / 24.0
+
+# Standard deviations of the inner wall's own handles: minus the mean of their neighbours, and in
+# all, in the units of `FreeSurface`.
+_ROUGHNESS, _OFFSET = 0.006, 0.04
+
+# Walls and bases that are looked at, as shares of the diameter; number of pixels of a look, and the
+# blur of its backdrop, in halvings.
+_WALLS, _BASES, _PIXELS, _BLUR = (0.008, 0.014, 0.022, 0.035, 0.055), (0.0, 0.045), 3000, 1
+
+# Blurs of the first steps, which choose the contents, and of the others; number of pixels of each.
+_FIRST, _OTHERS = (2, 2, 1), (1, 0, 0, 0, 0, 0, 0, 0)
+_FIRST_RAYS, _RAYS, _JUDGES = 12_000, 24_000, 8192
+
+# Share of the pixels of largest derivatives that a step leaves out, least scale of the robust
+# weights in the first step, sRGB, and least gain of a step.
+_OUTLIERS, _WIDEST, _GAIN = 0.02, 0.3, 0.002
+
+# Depth inside which distances are exact, in coarse cells of the grid.
+_DEEP = 4.0
+
+
+def distances_inside(outer: Mesh) -> Grid:
+    """Returns the distances from a closed surface on a grid, negative inside.
+
+    They are exact to a depth of a tenth of the diameter.
+    """
+    size = diameter(outer.vertices)
+    margin = 2.0 * _SPACING * size
+    box = Box(outer.vertices.min(axis=0) - margin, outer.vertices.max(axis=0) + margin)
+    return sample(signed_distance(outer), box, spacing=_SPACING * size, near=_DEEP)
+
+
+class FreeVessel(Vessel):
+    """A vessel as a `gauss_newton.Model`, full of air or of liquid.
+
+    The unknowns (`layout`) are the displacements of the handles of both walls, the indices of glass
+    and liquid, the logarithms of the tints, and the absorption of the liquid.
+
+    Attributes:
+      interior_at_start: what is inside at the start; heights are along the z axis.
+      layout: where the unknowns are; there is no axis.
+      size: diameter, world units.
+    """
+
+    def __init__(self, outer: Mesh, interior: Interior, inside: Grid) -> None:
+        """Takes the outer surface, what is inside, and the distances inside the surface.
+
+        Raises:
+          ReconstructionError: if the contents have a surface, or the wall leaves no space inside.
+        """
+        if interior.contents not in ("air", "liquid") or interior.mouth:
+            raise ReconstructionError(
+                f"A free vessel is full of air or of liquid, not of {interior.name}. Pass one of "
+                "these, or a body of revolution."
+            )
+        self.interior_at_start, self.size = interior, diameter(outer.vertices)
+        floor = float(outer.vertices[:, 2].min()) + interior.base
+        heights = inside.low[2] + inside.spacing * np.arange(inside.values.shape[2])
+        space = inside._replace(values=np.maximum(inside.values + interior.wall, floor - heights))
+        inner = find_isosurface(space)
+        self._outer_surface = FreeSurface(outer)
+        self._inner_surface = FreeSurface(
+            inner, _INNER * self.size, roughness=_ROUGHNESS, size=_OFFSET
+        )
+        nearest = KDTree(outer.vertices).query(inner.vertices)[1]
+        weights = [self._outer_surface.weights[nearest], self._inner_surface.weights]
+        self.layout = Layout(
+            interior, weights[0].shape[1], len(self._inner_surface.handles), axis=0
+        )
+        self._inner_surface.weights = scipy.sparse.hstack(weights).tocsr()
+
+    def _surfaces(self, x: Float[np.ndarray, " unknowns"]) -> list[Posed]:
+        """Returns the surfaces of both walls, with columns for all unknowns."""
+        layout = self.layout
+        walls = (
+            self._outer_surface.pose(x[layout.outer]),
+            self._inner_surface.pose(x[: layout.inner.stop]),
+        )
+        return [
+            wall._replace(
+                by_vertices=_widened(wall.by_vertices, len(x)),
+                by_normals=_widened(wall.by_normals, len(x)),
+            )
+            for wall in walls
+        ]
+
+    def prior(
+        self, x: Float[np.ndarray, " unknowns"]
+    ) -> tuple[Float[np.ndarray, "unknowns unknowns"], Float[np.ndarray, " unknowns"]]:
+        """Returns the prior: near the start, and handles that move like their neighbours."""
+        layout = self.layout
+        deviations = np.ones(layout.count)
+        for where, deviation in self._deviations_of_media():
+            deviations[where] = deviation
+        precision = np.diag(deviations**-2.0)
+        for where, surface in (
+            (layout.outer, self._outer_surface),
+            (layout.inner, self._inner_surface),
+        ):
+            own, _ = surface.prior(x[where])
+            precision[where, where] = scipy.sparse.csr_array(own).toarray()
+        return precision, precision @ self._away(x)
+
+
+def fit_free_vessel(
+    mesh: Mesh,
+    surface: Backdrop,
+    pixels: Photographs,
+    judges: Photographs,
+    *,
+    glass: float = 1.5,
+    outlines: Callable[[Candidate], Rows] | None = None,
+    seed: int = 0,
+    progress: Callable[[float, str], None] = lambda share, text: None,
+) -> Trial | None:
+    """Fits a vessel of any shape that is full of air or of liquid.
+
+    Args:
+      mesh: outer surface, from masks only.
+      surface: backdrop.
+      pixels: pixels to fit.
+      judges: other pixels.
+      glass: index of refraction of the glass to begin with.
+      outlines: equations of the masks' outlines.
+      seed: seed of the draws.
+      progress: called with the share of the work that is done, and a line of text.
+
+    Returns:
+      The better of both contents; `None` if no wall leaves space inside.
+    """
+    progress(0.0, "distances inside")
+    inside = distances_inside(mesh)
+    some = judges.drawn(np.random.default_rng(seed), _PIXELS)
+    count, done, best = 2 * len(_FIRST) + len(_OTHERS), 0, None
+
+    def fitted(vessel: FreeVessel, x: np.ndarray, blurs: tuple[int, ...], rays: int) -> Fit:
+        nonlocal done
+        begin = done
+        done += len(blurs)
+        return gauss_newton.fit(
+            vessel,
+            x,
+            surface,
+            pixels,
+            settings=Steps(blurs, rays, _JUDGES, _OUTLIERS, seed=seed, widest=_WIDEST, gain=_GAIN),
+            outlines=outlines,
+            progress=lambda step, facts: progress(
+                (begin + step) / count, f"{vessel.interior_at_start.name}: {facts.after:.4f}"
+            ),
+        )
+
+    for at in (Interior("air", glass=glass, stained=True), Interior("liquid", glass=glass)):
+        vessel = _best_wall(mesh, at, inside, surface, some)
+        if vessel is None:
+            continue
+        fit = fitted(vessel, vessel.start(), _FIRST, _FIRST_RAYS)
+        trial = judged(f"free vessel: {at.name}", vessel, fit, surface, judges)
+        if best is None or trial.error < best[0].error:
+            best = (trial, vessel)
+    if best is None:
+        return None
+    trial, vessel = best
+    return judged(trial.name, vessel, fitted(vessel, trial.fit.x, _OTHERS, _RAYS), surface, judges)
+
+
+def _best_wall(
+    mesh: Mesh, at: Interior, inside: Grid, surface: Backdrop, pixels: Photographs
+) -> FreeVessel | None:
+    """Returns the vessel with the wall and the base that suit it best, if one leaves space."""
+    size, blurred = diameter(mesh.vertices), photometry.blurred(surface, _BLUR)
+    found: list[tuple[float, int, FreeVessel]] = []
+    for wall in _WALLS:
+        for base in _BASES:
+            with contextlib.suppress(ReconstructionError):
+                shape = dataclasses.replace(at, wall=wall * size, base=base * size)
+                vessel = FreeVessel(mesh, shape, inside)
+                traced = gauss_newton.traced_object(vessel.pose(vessel.start()))
+                error = float(gauss_newton.errors_of(traced, blurred, pixels).mean())
+                found.append((error, len(found), vessel))
+    return min(found)[2] if found else None
+
+
+def _widened(matrix: scipy.sparse.csr_array, count: int) -> scipy.sparse.csr_array:
+    """Returns a matrix with further columns, of zeros."""
+    nothing = scipy.sparse.csr_array((matrix.shape[0], count - matrix.shape[1]))
+    return scipy.sparse.hstack([matrix, nothing]).tocsr()

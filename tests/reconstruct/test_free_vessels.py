@@ -1,0 +1,96 @@
+"""Vessels of any shape: their two surfaces, and what light tells of the wall."""
+
+import numpy as np
+import pytest
+
+from refref_jax.geometry.triangle_meshes import make_mesh, volume
+from refref_jax.reconstruct import ReconstructionError, gauss_newton, photometry
+from refref_jax.reconstruct.contents import Interior
+from refref_jax.reconstruct.free_vessels import FreeVessel, distances_inside
+from refref_jax.reconstruct.mesh_distance import signed_distance
+from tests.factories import bodies, vessels
+from tests.laws import posed_surfaces
+
+
+@pytest.fixture(scope="module")
+def mesh():
+    """A pebble without an axis of revolution."""
+    ball = bodies.icosphere(4)
+    lobes = 1.0 + 0.08 * np.cos(3.0 * np.arctan2(ball.vertices[:, 1], ball.vertices[:, 0]))
+    return make_mesh(ball.vertices * lobes[:, None] * [1.1, 0.9, 1.0], ball.faces)
+
+
+@pytest.fixture(scope="module")
+def inside(mesh):
+    return distances_inside(mesh)
+
+
+@pytest.fixture(scope="module")
+def vessel(mesh, inside):
+    return FreeVessel(mesh, Interior("air", wall=0.12, base=0.3, stained=True), inside)
+
+
+def test_the_inner_wall_is_at_its_distance_and_above_its_base(mesh, vessel):
+    glass, air = vessel.solids(vessel.start())
+    depth = -signed_distance(mesh)(air.mesh.vertices)
+    low = mesh.vertices[:, 2].min()
+    assert air.mesh.vertices[:, 2].min() == pytest.approx(low + 0.3, abs=0.01)
+    assert depth.min() == pytest.approx(0.12, abs=0.01)
+    above = air.mesh.vertices[:, 2] > low + 0.4
+    np.testing.assert_allclose(depth[above], 0.12, atol=0.01)
+    assert (glass.index, air.index, air.parent) == (1.5, 1.0, 0)
+    assert volume(air.mesh.vertices, air.mesh.faces) > 0.0
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_derivatives_are_central_differences(vessel, number):
+    posed_surfaces.assert_derivatives(
+        posed_surfaces.PartOf(vessel, number), step=1e-6, tolerance=1e-5
+    )
+
+
+def test_the_prior_is_quadratic(vessel):
+    posed_surfaces.assert_prior(vessel)
+
+
+def test_the_inner_wall_follows_the_outer_one(vessel):
+    x = vessel.start()
+    x[vessel.layout.outer] = 0.05
+    before, after = (vessel.pose(each).parts for each in (vessel.start(), x))
+    for one, other in zip(before, after, strict=True):
+        moved = np.linalg.norm(other.vertices - one.vertices, axis=-1)
+        np.testing.assert_allclose(moved, 0.05, atol=1e-9)
+    x[vessel.layout.inner] = -0.02
+    thinner = vessel.pose(x).parts[1].vertices - before[1].vertices
+    np.testing.assert_allclose(np.linalg.norm(thinner, axis=-1), 0.03, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("interior", "message"),
+    [
+        (Interior("liquid and air"), "liquid and air"),
+        (Interior("air", mouth=True), "open"),
+        (Interior("air", wall=1.2), "below"),
+        (Interior("air", wall=0.1, base=5.0), "below"),
+    ],
+)
+def test_what_it_cannot_be_is_refused(mesh, inside, interior, message):
+    with pytest.raises(ReconstructionError, match=message):
+        FreeVessel(mesh, interior, inside)
+
+
+def test_light_finds_thickness_and_tint(mesh, inside, monkeypatch):
+    monkeypatch.setattr(photometry, "_TILE", 1024)
+    surface, tint = vessels.smooth_backdrop(), (0.9, 0.97, 0.85)
+    truth = Interior("air", wall=0.12, glass=1.5, stained=True, glass_tint=tint)
+    seen = vessels.photographs(FreeVessel(mesh, truth, inside), surface, reach=0.7)
+    start = FreeVessel(mesh, Interior("air", wall=0.16, stained=True), inside)
+    steps = gauss_newton.Steps((1, 1, *[0] * 6), 4096, 4096)
+    fit = gauss_newton.fit(start, start.start(), surface, seen, settings=steps)
+    found = start.interior(fit.x)
+    assert found.glass_tint == pytest.approx(tint, abs=0.02)
+    glass, air = start.solids(fit.x)
+    depth = -signed_distance(glass.mesh)(air.mesh.vertices)
+    # Thin walls shift light by thickness times (index - 1), nearly; 0.08 at the start.
+    assert np.median(depth) * (found.glass - 1.0) == pytest.approx(0.06, rel=0.06)
+    assert fit.steps[-1].after < 0.2 * fit.steps[0].before
