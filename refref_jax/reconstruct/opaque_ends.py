@@ -34,7 +34,7 @@ from refref_jax.reconstruct.walls import Outline, Stretch
 from refref_jax.render.images import find_first_surface
 
 # Rows of places along the axis and sectors around it, and number of pixels that are sorted.
-_ROWS, _SECTORS, _PIXELS = 128, 12, 65_536
+_ROWS, _SECTORS, _PIXELS = 128, 12, 32_768
 
 # Fewest pixels of a place, and fewest independent numbers of a row.
 _FEWEST, _KNOWN = 4, 60
