@@ -7,7 +7,13 @@ import pytest
 
 from refref_jax.geometry.triangle_meshes import volume
 from refref_jax.optics.interface_rules import NO_PARENT
-from refref_jax.reconstruct import ReconstructionError, gauss_newton, interior_looks, photometry
+from refref_jax.reconstruct import (
+    ReconstructionError,
+    gauss_newton,
+    interior_looks,
+    interior_search,
+    photometry,
+)
 from refref_jax.reconstruct.contents import Detail, Interior
 from refref_jax.reconstruct.families import Revolution
 from refref_jax.reconstruct.interior_looks import SearchSettings, hypotheses, look
@@ -235,7 +241,9 @@ def test_the_simplest_of_equally_good_findings_is_kept(body, surface, photograph
     assert _simplest([wrong, simple, stained]) is simple
 
 
-def test_levels_are_looked_at_again_with_both_mouths(body, surface, photographs):
+def test_levels_are_looked_at_again_with_both_mouths(body, surface, photographs, monkeypatch):
+    levels_and_gaps = interior_search._VARIANTS[:2]
+    monkeypatch.setattr(interior_search, "_VARIANTS", levels_and_gaps)
     off = dataclasses.replace(_FLASK, level=_FLASK.level + 0.16, gap=0.02)
     vessel = Vessel(body, off, _SMALL)
     x = vessel.start()
