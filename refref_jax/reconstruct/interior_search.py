@@ -183,7 +183,8 @@ def search(
         rough.append(_few_fitted(outer, found.interior, surface, pixels, judges, settings))
         say(f"{rough[-1].name}: looked {found.error:.4f}, error {rough[-1].error:.4f}")
     rivals = _best_of_kinds(rough, settings)
-    for interior in _looked_again(outer, rivals, surface, pixels, settings):
+    again = _looked_again(outer, rivals, surface, pixels, settings)
+    for interior in again or [each.vessel.interior_at_start for each in rivals]:
         vessel = Vessel(outer, interior, detail)
         start, steps = vessel.start(), settings.all
         fitted = _fitted(vessel, start, surface, pixels, judges, settings, steps, outlines)
@@ -289,8 +290,8 @@ def _looked_again(
             if best.error < math.inf:  # otherwise there is no mouth at its top
                 name = best.interior.name
                 kept[name] = min(kept.get(name, best), best, key=_error)
-    least = min(each.error for each in kept.values())
-    return [each.interior for each in kept.values() if each.error < settings.rivals * least]
+    least = min((each.error for each in kept.values()), default=math.inf)
+    return [each.interior for each in kept.values() if each.error <= settings.rivals * least]
 
 
 _error = operator.attrgetter("error")
