@@ -194,17 +194,17 @@ def colours_seen(
 
 def remaining(outer: Revolution, ends: Sequence[OpaqueEnd]) -> Revolution:
     """Returns the body between its opaque ends, with flat ends where they were."""
-    low, high = _limits(outer, ends)
-    points = outer.points
-    above = np.flatnonzero(points[:, 1] > low)
-    below = np.flatnonzero(points[:, 1] < high)
-    kept = points[above[0] : below[-1] + 1]
-    if above[0] > 0:
-        rim = _at_height(points[above[0] - 1], points[above[0]], low)
-        kept = np.concatenate([[[0.0, low]], rim, kept])
-    if below[-1] + 1 < len(points):
-        rim = _at_height(points[below[-1]], points[below[-1] + 1], high)
-        kept = np.concatenate([kept, rim, [[0.0, high]]])
+    points, (low, high) = outer.points, _limits(outer, ends)
+    kept, (bottom, top) = points, _extent(outer)
+    if high < top:
+        last = int(np.argmax(kept[:, 1] >= high))
+        rim = _at_height(kept[last - 1], kept[last], high)
+        kept = np.concatenate([kept[:last], rim, [[0.0, high]]])
+    if low > bottom:
+        # After the last point below: a hollow under a foot may begin above its rim.
+        first = int(np.flatnonzero(kept[:, 1] <= low)[-1]) + 1
+        rim = _at_height(kept[first - 1], kept[first], low)
+        kept = np.concatenate([[[0.0, low]], rim, kept[first:]])
     profile = Profile(walls.even(kept, _EVEN), closed=False)
     return Revolution(outer.axis, profile, float(max(2.0 * kept[:, 0].max(), np.ptp(kept[:, 1]))))
 

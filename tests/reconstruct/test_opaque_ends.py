@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from refref_jax.geometry.triangle_meshes import volume
-from refref_jax.reconstruct import opaque_ends, photometry
+from refref_jax.reconstruct import opaque_ends, photometry, walls
 from refref_jax.reconstruct.families import Revolution
 from refref_jax.reconstruct.mesh_distance import signed_distance
 from refref_jax.reconstruct.opaque_ends import OpaqueEnd, find_opaque_ends, remaining
@@ -115,3 +115,15 @@ def test_pixels_of_ends_are_left_out(body, clear):
     painted = ~np.isnan(opaque_ends.colours_seen(body, (end,), clear.rays)[:, 0])
     assert np.all(seen[painted])
     assert not opaque_ends.seen_by(body, (OpaqueEnd(5.0, 6.0, _BLUE),), clear)[painted].any()
+
+
+def test_without_ends_all_of_the_body_remains(body):
+    whole = remaining(body, ())
+    assert np.ptp(whole.points[:, 1]) == pytest.approx(np.ptp(body.points[:, 1]), abs=1e-3)
+
+
+def test_a_foot_may_be_hollow(body):
+    hollow = Revolution(body.axis, walls.with_punt(Profile(body.points, closed=False), 0.5), 2.6)
+    foot = _foot(hollow, 0.3)
+    glass = remaining(hollow, (foot,))
+    assert glass.points[:, 1].min() == pytest.approx(foot.high, abs=0.02)
