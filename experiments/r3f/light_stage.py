@@ -224,7 +224,7 @@ def _solid_ends(revolved: Revolved) -> list[Solid]:
     found, outer = [], revolved.outer
     for end in revolved.ends if outer is not None else ():
         mesh = opaque_ends.mesh_of_end(outer, end)
-        name = "cap" if end.low > outer.points[:, 1].mean() else "foot"
+        name = "cap" if end.is_cap(outer) else "foot"
         found.append(Solid(name, mesh, INDEX_OF_AIR, NO_PARENT, CLEAR, radiance=end.colour))
     return found
 

@@ -43,7 +43,7 @@ _FEWEST, _KNOWN = 4, 60
 # least variation of a backdrop that tells anything, sRGB.
 _OPAQUE, _INFORMED = 0.35, 0.04
 
-# Least and largest share of the rows that an end takes.
+# Least share of the rows that an end takes, and largest share of all ends together.
 _LEAST, _MOST = 0.03, 0.7
 
 # Rows beside an end whose pixels count as its own.
@@ -68,6 +68,10 @@ class OpaqueEnd(NamedTuple):
     low: float
     high: float
     colour: Colour
+
+    def is_cap(self, outer: Revolution) -> bool:
+        """Returns whether it is the upper end of a body, not the lower one."""
+        return self.low + self.high > sum(_extent(outer))
 
 
 def find_opaque_ends(
@@ -166,7 +170,8 @@ def _runs_at_ends(
     below, above = dark[dark < clear[0]], dark[dark > clear[-1]]
     runs = [(0, int(below[-1]) + 1)] if len(below) else []
     runs += [(int(above[0]), count)] if len(above) else []
-    return [run for run in runs if _LEAST * count <= run[1] - run[0] <= _MOST * count]
+    runs = [run for run in runs if run[1] - run[0] >= _LEAST * count]
+    return runs if sum(last - first for first, last in runs) <= _MOST * count else []
 
 
 def seen_by(
@@ -212,12 +217,12 @@ def remaining(outer: Revolution, ends: Sequence[OpaqueEnd]) -> Revolution:
 def _limits(outer: Revolution, ends: Sequence[OpaqueEnd]) -> tuple[float, float]:
     """Returns the heights between which the body is clear."""
     low, high = _extent(outer)
-    apart, middle = _APART * (high - low), 0.5 * (low + high)
+    apart = _APART * (high - low)
     for end in ends:
-        if 0.5 * (end.low + end.high) < middle:
-            low = end.high + apart
-        else:
+        if end.is_cap(outer):
             high = end.low - apart
+        else:
+            low = end.high + apart
     return low, high
 
 

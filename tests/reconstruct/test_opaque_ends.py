@@ -89,6 +89,17 @@ def test_what_is_opaque_as_a_whole_has_no_ends(body, surface, clear):
     assert find_opaque_ends(ring, surface, clear) == ()
 
 
+def test_two_ends_that_leave_little_are_none(body, surface, clear):
+    ends = (_foot(body, 1.2), _cap(body, 1.2))
+    assert find_opaque_ends(body, surface, _painted(body, clear, *ends)) == ()
+
+
+def test_a_high_cap_is_no_foot(body):
+    cap, foot = _cap(body, 1.7), _foot(body, 0.3)
+    assert cap.is_cap(body) and not foot.is_cap(body)
+    assert remaining(body, (foot, cap)).points[:, 1].max() == pytest.approx(cap.low, abs=0.02)
+
+
 def test_few_pixels_tell_nothing(body, surface, clear):
     some = _painted(body, clear, _cap(body, 0.55)).chosen(np.arange(40))
     assert find_opaque_ends(body, surface, some) == ()
