@@ -44,7 +44,8 @@ def draw(
       surface: backdrop.
       deviations: standard deviation of each normal of the chosen surface, degrees; `None` if light
         has not determined them.
-      ends: returns the linear RGB of the opaque part that each ray meets first, NaN without any.
+      ends: function of rays that returns the linear RGB of the opaque part that each meets first,
+        NaN without any.
     """
     frames = scene_folder.read_frames(scene, split)
     count = len(frames.names)
@@ -91,10 +92,11 @@ def _panels(
     flat = rays._replace(**{k: getattr(rays, k).reshape(-1, *s) for k, s in _SHAPES.items()})
     photograph = image.astype(np.float64) / 255.0
     predicted, opaque = [], ends(flat)
-    for trial in trials:
+    for number, trial in enumerate(trials):
         traced = gauss_newton.traced_object(trial.model.pose(trial.fit.x))
         linear = photometry.predict(traced, surface, flat).linear
-        linear = np.where(np.isnan(opaque), linear, opaque)
+        if number > 0:  # the surface from masks has no opaque parts
+            linear = np.where(np.isnan(opaque), linear, opaque)
         predicted.append(photometry.encode(linear).reshape(photograph.shape))
     errors = [
         np.where(mask, np.sqrt(np.mean((each - photograph) ** 2, axis=-1)), np.nan)

@@ -8,16 +8,18 @@ index (`reconstruct.shape_from_refraction`). If the object is a body of revoluti
 glass explains its pixels, the stage looks at what may be inside instead of a free surface
 (`reconstruct.interior_search`). In a solid that was chosen, it looks for bubbles of air
 (`reconstruct.bubble_search`). Vessels and solids with bubbles become several parts. Opaque caps and
-feet of bodies of revolution are parts of their own (`reconstruct.opaque_ends`). Pixels that
+feet of bodies of revolution are parts of their own (`reconstruct.opaque_ends`). Where nothing else
+explains the pixels, a vessel of any shape is fitted (`reconstruct.free_vessels`). Pixels that
 were not fitted judge: those of the validation views, or of every eighth training view where these
 have no masks. Where the background is a field, and where light explains nothing better, the surface
 stays as it is.
 """
 
+import functools
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -99,7 +101,7 @@ class Seen(NamedTuple):
     split: Split
 
 
-class Revolved(NamedTuple):
+class RevolvedObject(NamedTuple):
     """The object as a body of revolution.
 
     Attributes:
@@ -137,20 +139,21 @@ def run(
     revolved = look_at_ends(mesh, surface, seen, seed=seed)
     trials = fit(scene, mesh, known, surface, seen, revolved, seed=seed)
     masks, chosen, remark = choose(scene, mesh, trials)
+    if revolved.ends and chosen is not masks and not isinstance(chosen.model, Vessel):
+        chosen, remark = masks, "an end is opaque, and what remains is no vessel"
     kept = chosen is not masks
+    written = revolved if isinstance(chosen.model, Vessel) else RevolvedObject(None)
     deviations = model_selection.normal_deviations(chosen) if kept else None
     parts: tuple[PartFacts, ...] = ()
     with atomic_files.written_folder(target.parent) as folder:
         if kept and isinstance(chosen.model, Vessel | ObjectWithBubbles):
-            solids = chosen.model.solids(chosen.fit.x)
-            if isinstance(chosen.model, Vessel):
-                solids += _solid_ends(revolved)
+            solids = [*chosen.model.solids(chosen.fit.x), *_solid_ends(written)]
             parts = _write_parts(folder, target.stem, solids, known)
         elif kept:
             meshes.write_mesh(folder / target.name, *chosen.mesh)
         views = (scene, seen.split)
         light_figures.draw(
-            folder / FIGURE, *views, masks, chosen, surface, deviations, revolved.ends_seen
+            folder / FIGURE, *views, masks, chosen, surface, deviations, written.ends_seen
         )
     unknown = 1.0 if deviations is None else float(np.mean(deviations > _UNKNOWN))
     estimated = known.source == "estimated"
@@ -219,7 +222,7 @@ def _write_parts(
     return tuple(facts)
 
 
-def _solid_ends(revolved: Revolved) -> list[Solid]:
+def _solid_ends(revolved: RevolvedObject) -> list[Solid]:
     """Returns the opaque ends as parts."""
     found, outer = [], revolved.outer
     for end in revolved.ends if outer is not None else ():
@@ -246,12 +249,13 @@ def read(scene: Path, *, seed: int) -> Seen:
     return Seen(fitted.chosen(np.flatnonzero(~held)), fitted.chosen(some), "train")
 
 
-def look_at_ends(mesh: Mesh, surface: Backdrop, seen: Seen, *, seed: int) -> Revolved:
+def look_at_ends(mesh: Mesh, surface: Backdrop, seen: Seen, *, seed: int) -> RevolvedObject:
     """Returns the object as a body of revolution, if it is one, with its opaque ends."""
     outer = families.fit_revolution(mesh, furthest=_FURTHEST)
     if outer is None:
-        return Revolved(None)
-    return Revolved(outer, opaque_ends.find_opaque_ends(outer, surface, seen.fitted, seed=seed))
+        return RevolvedObject(None)
+    ends = opaque_ends.find_opaque_ends(outer, surface, seen.fitted, seed=seed)
+    return RevolvedObject(outer, ends)
 
 
 def fit(
@@ -260,7 +264,7 @@ def fit(
     known: IndexFacts,
     surface: Backdrop,
     seen: Seen,
-    revolved: Revolved,
+    revolved: RevolvedObject,
     *,
     seed: int,
 ) -> tuple[Trial, ...]:
@@ -307,7 +311,7 @@ def fit(
     return (*trials, *_with_bubbles(chosen, surface, seen, outlines, seed=seed))
 
 
-def _between_ends(revolved: Revolved, seen: Seen) -> tuple[Revolution | None, Seen]:
+def _between_ends(revolved: RevolvedObject, seen: Seen) -> tuple[Revolution | None, Seen]:
     """Returns the clear part of a body, and the pixels that do not see its opaque ends."""
     if revolved.outer is None or not revolved.ends:
         return revolved.outer, seen
@@ -315,7 +319,7 @@ def _between_ends(revolved: Revolved, seen: Seen) -> tuple[Revolution | None, Se
         each.chosen(np.flatnonzero(~opaque_ends.seen_by(revolved.outer, revolved.ends, each)))
         for each in (seen.fitted, seen.judges)
     )
-    return opaque_ends.remaining(revolved.outer, revolved.ends), Seen(fitted, judges, seen.split)
+    return opaque_ends.clear_part(revolved.outer, revolved.ends), Seen(fitted, judges, seen.split)
 
 
 def _with_bubbles(
@@ -326,17 +330,25 @@ def _with_bubbles(
     The search itself finds out whether it is worth while: it ends after one picture of some pixels
     if nowhere inside the errors of the paths stand out.
     """
-    with ProgressBar("bubbles", 100) as bar:
-        found = bubble_search.find_bubbles(
-            chosen,
+    find = functools.partial(bubble_search.find_bubbles, chosen)
+    found = _with_bar("bubbles", find, surface, seen, outlines=outlines, seed=seed)
+    return [] if found is chosen else [found]
+
+
+def _with_bar(
+    name: str, find: Callable[..., Trial | None], surface: Backdrop, seen: Seen, **options: Any
+) -> Trial | None:
+    """Returns what a search finds, which shows a progress bar."""
+    with ProgressBar(name, 100) as bar:
+        found = find(
             surface,
             seen.fitted,
             seen.judges,
-            outlines=outlines,
-            seed=seed,
             progress=lambda share, text: bar.show(round(100 * share), text),
+            **options,
         )
-    return [] if found is chosen else [found]
+        bar.show(100, "done")
+    return found
 
 
 def _may_be_vessel(outer: Revolution | None, trials: Sequence[Trial]) -> bool:
@@ -352,20 +364,14 @@ def _free_vessels(
     mesh: Mesh, known: IndexFacts, surface: Backdrop, seen: Seen, outlines: Outlines, *, seed: int
 ) -> list[Trial]:
     """Returns a vessel that is no body of revolution; none if no wall fits into the object."""
-    glass = {"glass": known.index} if known.source == "given" else {}
-    with ProgressBar("free vessel", 100) as bar:
-        found = free_vessels.fit_free_vessel(
-            mesh,
-            surface,
-            seen.fitted,
-            seen.judges,
-            outlines=outlines,
-            seed=seed,
-            progress=lambda share, text: bar.show(round(100 * share), text),
-            **glass,
-        )
-        bar.show(100, "done")
+    find = functools.partial(free_vessels.fit_free_vessel, mesh, **_glass(known))
+    found = _with_bar("free vessel", find, surface, seen, outlines=outlines, seed=seed)
     return [] if found is None else [found]
+
+
+def _glass(known: IndexFacts) -> dict[str, Any]:
+    """Returns options of a search inside: a given index of the glass is kept."""
+    return {"glass": known.index, "glass_deviation": 0.0} if known.source == "given" else {}
 
 
 def _vessels(
@@ -378,8 +384,7 @@ def _vessels(
     seed: int,
 ) -> list[Trial]:
     """Returns vessels that were fitted; none if solid glass is the best look, or no wall fits."""
-    glass = {"glass": known.index} if known.source == "given" else {}
-    settings = SearchSettings(seed=seed, **glass)
+    settings = SearchSettings(seed=seed, **_glass(known))
     try:
         found = _search(outer, surface, seen, outlines, settings)
     except ReconstructionError:
@@ -402,7 +407,8 @@ def _search(
     with ProgressBar("inside", 100) as bar:
         bar.show(0, "looking at hypotheses")
         looks = interior_looks.looks_at_all(outer, surface, seen.fitted, settings)
-        if looks[0].interior.contents == "none":
+        best = looks[0].interior
+        if best.contents == "none" and not best.stained:
             bar.show(100, "solid glass")
             return []
         count = itertools.count(10, 8)

@@ -9,6 +9,9 @@ from typing import Literal, NamedTuple
 Colour = tuple[float, float, float]
 """Linear RGB."""
 
+GLASS_DEVIATION = 0.03
+"""Standard deviation of the index of glass, which is nearly known."""
+
 Contents = Literal["none", "air", "liquid", "liquid and air"]
 """What is inside the glass; `none` is solid glass."""
 
@@ -48,6 +51,7 @@ class Interior:
       level: height of the liquid's surface above the point of the axis, world units.
       gap: height of the glass between liquid and air, world units.
       glass: index of refraction of the glass.
+      glass_deviation: standard deviation of its prior; 0 keeps it.
       liquid: the same of the liquid.
       tint: factor on light at each crossing of the liquid's surface, linear RGB.
       absorption: absorption of the liquid, linear RGB, per world unit.
@@ -64,6 +68,7 @@ class Interior:
     level: float = 0.0
     gap: float = 0.01
     glass: float = 1.5
+    glass_deviation: float = GLASS_DEVIATION
     liquid: float = 1.36
     tint: Colour = (1.0, 1.0, 1.0)
     absorption: Colour = (0.0, 0.0, 0.0)

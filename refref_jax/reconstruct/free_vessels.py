@@ -20,14 +20,14 @@ from scipy.spatial import KDTree
 
 from refref_jax.geometry.triangle_meshes import Mesh, diameter
 from refref_jax.reconstruct import ReconstructionError, gauss_newton, photometry
-from refref_jax.reconstruct.contents import Interior, Layout
+from refref_jax.reconstruct.contents import GLASS_DEVIATION, Interior, Layout
 from refref_jax.reconstruct.gauss_newton import Candidate, Fit, Rows, Steps
 from refref_jax.reconstruct.grids import Box, Grid, find_isosurface, sample
 from refref_jax.reconstruct.interiors import Vessel
 from refref_jax.reconstruct.mesh_distance import signed_distance
 from refref_jax.reconstruct.model_selection import Trial, judged
 from refref_jax.reconstruct.photometry import Backdrop, Photographs
-from refref_jax.reconstruct.shapes import FreeSurface, Posed
+from refref_jax.reconstruct.shapes import FreeSurface, Posed, mesh_of
 
 # Distance between the points of the grid of distances, and between the handles of the inner wall,
 # as shares of the diameter.
@@ -76,7 +76,7 @@ class FreeVessel(Vessel):
       size: diameter, world units.
     """
 
-    def __init__(self, outer: Mesh, interior: Interior, inside: Grid) -> None:
+    def __init__(self, outer: Mesh, interior: Interior, distances: Grid) -> None:
         """Takes the outer surface, what is inside, and the distances inside the surface.
 
         Raises:
@@ -89,9 +89,9 @@ class FreeVessel(Vessel):
             )
         self.interior_at_start, self.size = interior, diameter(outer.vertices)
         floor = float(outer.vertices[:, 2].min()) + interior.base
-        heights = inside.low[2] + inside.spacing * np.arange(inside.values.shape[2])
-        space = inside._replace(values=np.maximum(inside.values + interior.wall, floor - heights))
-        inner = find_isosurface(space)
+        heights = distances.low[2] + distances.spacing * np.arange(distances.values.shape[2])
+        space = np.maximum(distances.values + interior.wall, floor - heights)
+        inner = find_isosurface(distances._replace(values=space))
         self._outer_surface = FreeSurface(outer)
         self._inner_surface = FreeSurface(
             inner, _INNER * self.size, roughness=_ROUGHNESS, size=_OFFSET
@@ -135,6 +135,11 @@ class FreeVessel(Vessel):
             precision[where, where] = scipy.sparse.csr_array(own).toarray()
         return precision, precision @ self._away(x)
 
+    def surfaces_cross(self, x: Float[np.ndarray, " unknowns"]) -> bool:
+        """Returns whether a vertex of the inner wall is outside the outer one."""
+        outer, inner = self._surfaces(x)
+        return bool(signed_distance(mesh_of(outer))(inner.vertices).max() >= 0.0)
+
 
 def fit_free_vessel(
     mesh: Mesh,
@@ -143,6 +148,7 @@ def fit_free_vessel(
     judges: Photographs,
     *,
     glass: float = 1.5,
+    glass_deviation: float = GLASS_DEVIATION,
     outlines: Callable[[Candidate], Rows] | None = None,
     seed: int = 0,
     progress: Callable[[float, str], None] = lambda share, text: None,
@@ -155,15 +161,16 @@ def fit_free_vessel(
       pixels: pixels to fit.
       judges: other pixels.
       glass: index of refraction of the glass to begin with.
+      glass_deviation: standard deviation of its prior; 0 keeps it.
       outlines: equations of the masks' outlines.
       seed: seed of the draws.
       progress: called with the share of the work that is done, and a line of text.
 
     Returns:
-      The better of both contents; `None` if no wall leaves space inside.
+      The better of both contents; `None` if no wall leaves space inside, or the walls cross.
     """
     progress(0.0, "distances inside")
-    inside = distances_inside(mesh)
+    distances = distances_inside(mesh)
     some = judges.drawn(np.random.default_rng(seed), _PIXELS)
     count, done, best = 2 * len(_FIRST) + len(_OTHERS), 0, None
 
@@ -183,8 +190,9 @@ def fit_free_vessel(
             ),
         )
 
-    for at in (Interior("air", glass=glass, stained=True), Interior("liquid", glass=glass)):
-        vessel = _best_wall(mesh, at, inside, surface, some)
+    known = Interior("air", glass=glass, glass_deviation=glass_deviation, stained=True)
+    for at in (known, dataclasses.replace(known, contents="liquid", stained=False)):
+        vessel = _best_wall(mesh, at, distances, surface, some)
         if vessel is None:
             continue
         fit = fitted(vessel, vessel.start(), _FIRST, _FIRST_RAYS)
@@ -194,11 +202,13 @@ def fit_free_vessel(
     if best is None:
         return None
     trial, vessel = best
-    return judged(trial.name, vessel, fitted(vessel, trial.fit.x, _OTHERS, _RAYS), surface, judges)
+    fit = fitted(vessel, trial.fit.x, _OTHERS, _RAYS)
+    last = judged(trial.name, vessel, fit, surface, judges)
+    return next((each for each in (last, trial) if not vessel.surfaces_cross(each.fit.x)), None)
 
 
 def _best_wall(
-    mesh: Mesh, at: Interior, inside: Grid, surface: Backdrop, pixels: Photographs
+    mesh: Mesh, at: Interior, distances: Grid, surface: Backdrop, pixels: Photographs
 ) -> FreeVessel | None:
     """Returns the vessel with the wall and the base that suit it best, if one leaves space."""
     size, blurred = diameter(mesh.vertices), photometry.blurred(surface, _BLUR)
@@ -207,7 +217,7 @@ def _best_wall(
         for base in _BASES:
             with contextlib.suppress(ReconstructionError):
                 shape = dataclasses.replace(at, wall=wall * size, base=base * size)
-                vessel = FreeVessel(mesh, shape, inside)
+                vessel = FreeVessel(mesh, shape, distances)
                 traced = gauss_newton.traced_object(vessel.pose(vessel.start()))
                 error = float(gauss_newton.errors_of(traced, blurred, pixels).mean())
                 found.append((error, len(found), vessel))

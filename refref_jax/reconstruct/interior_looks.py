@@ -1,8 +1,8 @@
 """Looks at hypotheses of what is inside a vessel, through a blurred backdrop.
 
-A look predicts a thousand pixels. Tints come first, because they remove most of the error, and are
+A look predicts some 1500 pixels. Tints come first, because they remove most of the error, and are
 found without tracing light again. Hypotheses start from the thickness of the wall, what is inside
-and the level; other gaps, liquids and an open mouth are tried for the best of them.
+and the level; other gaps, liquids, an open mouth and stained glass are tried for the best of them.
 
 Source: ours.
 """
@@ -18,7 +18,13 @@ import numpy as np
 from jaxtyping import Float
 
 from refref_jax.reconstruct import ReconstructionError, gauss_newton, photometry
-from refref_jax.reconstruct.contents import COARSE, Contents, Detail, Interior
+from refref_jax.reconstruct.contents import (
+    COARSE,
+    GLASS_DEVIATION,
+    Contents,
+    Detail,
+    Interior,
+)
 from refref_jax.reconstruct.families import Revolution
 from refref_jax.reconstruct.interiors import Vessel
 from refref_jax.reconstruct.photometry import Backdrop, Photographs
@@ -39,11 +45,12 @@ class SearchSettings:
     """Settings of a search.
 
     Attributes:
-      thicknesses: thicknesses of the wall, as shares of the diameter.
+      thicknesses: thicknesses of the wall, as shares of the height.
       levels: number of heights of the liquid's surface.
-      gaps: heights of the glass between liquid and air, as shares of the diameter.
+      gaps: heights of the glass between liquid and air, as shares of the height.
       indices: indices of refraction of the liquid.
       glass: index of refraction of the glass.
+      glass_deviation: standard deviation of its prior; 0 keeps it.
       mouths: whether vessels may be closed, open, or both.
       stained: whether all glass may have a tint; otherwise that of vessels without liquid alone.
       blur: halvings of the backdrop's resolution in looks.
@@ -65,6 +72,7 @@ class SearchSettings:
     gaps: tuple[float, ...] = (0.004, 0.04)
     indices: tuple[float, ...] = (1.36, 1.333, 1.47)
     glass: float = 1.5
+    glass_deviation: float = GLASS_DEVIATION
     mouths: tuple[bool, ...] = (False, True)
     stained: bool = False
     blur: int = 3
@@ -107,6 +115,7 @@ def hypotheses(outer: Revolution, *, settings: SearchSettings = SearchSettings()
                 wall=wall * size,
                 gap=settings.gaps[-1] * size,
                 glass=settings.glass,
+                glass_deviation=settings.glass_deviation,
                 liquid=settings.indices[0],
                 stained=settings.stained,
             )

@@ -247,7 +247,8 @@ def _fitted(
 
 
 def _finding(vessel: Vessel, fit: Fit, surface: Backdrop, judges: Photographs) -> Finding:
-    name = f"vessel: {vessel.interior_at_start.name}"
+    inside = vessel.interior_at_start
+    name = "stained glass" if inside.contents == "none" else f"vessel: {inside.name}"
     return Finding(vessel, judged(name, vessel, fit, surface, judges))
 
 
@@ -279,8 +280,8 @@ def _looked_again(
     kept: dict[str, Look] = {}
     for finding in findings:
         at = _with_wall(finding)
-        ends_open = at.contents in ("air", "liquid and air")
-        for mouth in sorted({at.mouth, *settings.mouths}) if ends_open else [False]:
+        may_be_open = at.contents in ("air", "liquid and air")
+        for mouth in sorted({at.mouth, *settings.mouths}) if may_be_open else [False]:
             best = Look(dataclasses.replace(at, mouth=mouth), math.inf)
             for variants in _VARIANTS:
                 others = variants(best.interior, size)
@@ -317,7 +318,8 @@ def _other_gaps(at: Interior, size: float) -> list[Interior]:
 
 def _other_bases(at: Interior, size: float) -> list[Interior]:
     """Returns the same with thicker bases, such as the stem of a glass."""
-    return [dataclasses.replace(at, base=base * size) for base in _BASES if base * size > at.wall]
+    bases = [base * size for base in _BASES if base * size > at.wall and at.contents != "none"]
+    return [dataclasses.replace(at, base=base) for base in bases]
 
 
 def _other_punts(at: Interior, size: float) -> list[Interior]:
@@ -327,7 +329,8 @@ def _other_punts(at: Interior, size: float) -> list[Interior]:
 
 def _other_lids(at: Interior, size: float) -> list[Interior]:
     """Returns the same with thicker lids, such as a stopper."""
-    lids = [lid * size for lid in _LIDS if lid * size > at.wall and not at.mouth]
+    closed = at.contents != "none" and not at.mouth
+    lids = [lid * size for lid in _LIDS if lid * size > at.wall and closed]
     return [dataclasses.replace(at, lid=lid) for lid in lids]
 
 

@@ -44,16 +44,18 @@ _KNOTS, _INNER_KNOTS = 36, 28
 _ANGLE, _SHIFT = 0.02, 0.01
 _OFFSET, _BEND = 0.008, 0.004
 _INNER_OFFSET, _INNER_BEND = 0.03, 0.012
+_LEVEL, _GAP = 0.12, 0.04
 
 # Ends of the outer wall may be hollow, which masks do not show: where its normal has at least this
 # share along the axis, deviations are larger by this factor.
-_LEVELLED, _HOLLOW = 0.9, 5.0
+_LEVELLED, _LOOSER = 0.9, 5.0
 
-_LEVEL, _GAP = 0.12, 0.04
+# The same of the index of a liquid, of the logarithm of a tint, and of absorption along the
+# diameter.
+_LIQUID, _TINT, _ABSORPTION = 0.1, 1.0, 5.0
 
-# The same of the indices of glass and liquid, of the logarithm of a tint, and of absorption along
-# the diameter.
-_GLASS, _LIQUID, _TINT, _ABSORPTION = 0.03, 0.1, 1.0, 5.0
+# The same of an index that is kept.
+_KEPT = 1e-9
 
 # Largest changes in a step: of level and gap, as a share of the diameter, of an index, of the
 # logarithm of a tint, and of absorption along the diameter. The inner wall, which no mask shows,
@@ -129,7 +131,7 @@ class Vessel:
       >>> vessel.interior(fit.x).level
 
     Attributes:
-      interior: what is inside at the start.
+      interior_at_start: what is inside at the start.
       layout: where the unknowns are.
       size: diameter, world units.
     """
@@ -146,7 +148,7 @@ class Vessel:
         profile = walls.with_punt(Profile(outer.points, closed=False), interior.punt)
         self.size = _size(outer.points)
         self._outer = Wall(profile, points=detail.outer, knots=_KNOTS)
-        self._unseen = self._hollow_ends()
+        self._looseness = self._find_looseness()
         self.layout = Layout(interior, _KNOTS, _INNER_KNOTS)
         if interior.contents != "none":
             ends = {"base": interior.base, "lid": interior.lid}
@@ -163,14 +165,14 @@ class Vessel:
             self._range = self._heights()
         self._plan = self._shares()
 
-    def _hollow_ends(self) -> Float[np.ndarray, " knots"]:
-        """Returns the factors of the deviations of the outer wall's knots."""
+    def _find_looseness(self) -> Float[np.ndarray, " knots"]:
+        """Returns factors of the deviations of the outer wall's knots, larger at its two ends."""
         at_knots = self._outer.directions[np.argmax(self._outer.hats, axis=0), 1]
         count = len(at_knots)
         first, last = np.flatnonzero(at_knots > -_LEVELLED), np.flatnonzero(at_knots < _LEVELLED)
         bottom, top = first[0] if len(first) else 0, last[-1] + 1 if len(last) else count
         number = np.arange(count)
-        return np.where((number < bottom) | (number >= top), _HOLLOW, 1.0)
+        return np.where((number < bottom) | (number >= top), _LOOSER, 1.0)
 
     def _limits(self) -> tuple[Limits, Int[np.ndarray, " points"]]:
         """Returns the limits of the inner wall at rest, and the nearest points of the outer one."""
@@ -429,7 +431,7 @@ class Vessel:
         deviations = np.full(layout.count, _TINT)
         for where, deviation in (
             (layout.axis, np.array([_ANGLE, _ANGLE, _SHIFT * size, _SHIFT * size])),
-            (layout.outer, _OFFSET * size * self._unseen),
+            (layout.outer, _OFFSET * size * self._looseness),
             (layout.inner, _INNER_OFFSET * size),
             (layout.level, _LEVEL * size),
             (layout.gap, _GAP * size),
@@ -442,15 +444,16 @@ class Vessel:
             if count:
                 bends = np.diff(np.eye(count), 2, axis=0)
                 if where == layout.outer:
-                    bends /= np.maximum(self._unseen[:-2], self._unseen[2:])[:, None]
+                    bends /= np.maximum(self._looseness[:-2], self._looseness[2:])[:, None]
                 precision[where, where] += bends.T @ bends / (bend * size) ** 2
         return precision, precision @ self._away(x)
 
     def _deviations_of_media(self) -> list[tuple[slice, float]]:
         """Returns the standard deviations of indices and absorption."""
         at = self.layout
+        glass = self.interior_at_start.glass_deviation or _KEPT
         absorbs = (at.absorption, _ABSORPTION / self.size)
-        return [(at.glass, _GLASS), (at.liquid, _LIQUID), absorbs]
+        return [(at.glass, glass), (at.liquid, _LIQUID), absorbs]
 
     def _away(self, x: Float[np.ndarray, " unknowns"]) -> Float[np.ndarray, " unknowns"]:
         """Returns how far unknowns are from those that the prior expects: clear media."""
@@ -486,6 +489,6 @@ def _not_negative(values: np.ndarray) -> np.ndarray:
 
 
 def _size(points: Curve) -> float:
-    """Returns the diameter of a body of revolution: the diagonal of its box."""
+    """Returns the diameter of a body of revolution: its width or its height."""
     across, height = 2.0 * points[:, 0].max(), points[:, 1].max() - points[:, 1].min()
     return float(max(across, height))

@@ -3,9 +3,10 @@
 A place on a matt surface has the same colour in every photograph. Through glass, each photograph
 shows another part of the backdrop there. So pixels are sorted by the place where they first meet
 the surface; where their colours vary far less than those of the backdrop behind them, the surface
-is opaque. Only its two ends are looked at: `remaining` returns the glass between them.
+is opaque. Only its two ends are looked at: `clear_part` returns the glass between them.
 
-Labels and rings around glass are not found, and shiny or clear plastic is not opaque.
+Labels and rings around glass are not found, and shiny plastic is not opaque. A very dark liquid at
+an end may pass as opaque.
 
 Source: ours; photo-consistency is that of Seitz and Dyer: Photorealistic Scene Reconstruction by
 Voxel Coloring (1997).
@@ -37,14 +38,14 @@ from refref_jax.render.images import find_first_surface
 _ROWS, _SECTORS, _PIXELS = 128, 12, 32_768
 
 # Fewest pixels of a place, and fewest independent numbers of a row.
-_FEWEST, _KNOWN = 4, 60
+_MIN_PIXELS, _MIN_FREEDOM = 4, 60
 
 # Variation of the colours of opaque places, as a share of that of the backdrop behind them, and the
 # least variation of a backdrop that tells anything, sRGB.
-_OPAQUE, _INFORMED = 0.35, 0.04
+_MAX_VARIATION, _MIN_BACKDROP_VARIATION = 0.35, 0.04
 
 # Least share of the rows that an end takes, and largest share of all ends together.
-_LEAST, _MOST = 0.03, 0.7
+_MIN_SHARE, _MAX_SHARE = 0.03, 0.7
 
 # Rows beside an end whose pixels count as its own.
 _MARGIN = 1.5
@@ -53,7 +54,7 @@ _MARGIN = 1.5
 _APART = 0.002
 
 # Points of the profile of an end, half-planes of its mesh, and points of the glass's profile.
-_POINTS, _AZIMUTHS, _EVEN = 96, 96, 600
+_POINTS, _AZIMUTHS, _PROFILE_POINTS = 96, 96, 600
 
 
 class OpaqueEnd(NamedTuple):
@@ -98,8 +99,8 @@ def find_opaque_ends(
     rows, cells = _places(outer, some.rays)
     seen, known = _variations(cells, some.rgb)
     shown, _ = _variations(cells, straight)
-    known &= shown > _INFORMED
-    opaque = known & (seen < _OPAQUE * shown)
+    known &= shown > _MIN_BACKDROP_VARIATION
+    opaque = known & (seen < _MAX_VARIATION * shown)
     found, (bottom, top) = [], _extent(outer)
     for first, last in _runs_at_ends(opaque, known):
         inside = (rows >= first) & (rows < last)
@@ -147,14 +148,14 @@ def _variations(
     kept = cells >= 0
     at, values = cells[kept], rgb[kept].astype(np.float64)
     numbers = np.bincount(at, minlength=count)
-    usable = numbers >= _FEWEST
+    usable = numbers >= _MIN_PIXELS
     total = np.zeros(count)
     for channel in values.T:
         mean = np.bincount(at, channel, count) / np.maximum(numbers, 1)
         total += np.bincount(at, (channel - mean[at]) ** 2, count)
     freedom = np.where(usable, 3.0 * (numbers - 1), 0.0).reshape(_ROWS, _SECTORS).sum(axis=1)
     squares = np.where(usable, total, 0.0).reshape(_ROWS, _SECTORS).sum(axis=1)
-    return np.sqrt(squares / np.maximum(freedom, 1.0)), freedom > _KNOWN
+    return np.sqrt(squares / np.maximum(freedom, 1.0)), freedom > _MIN_FREEDOM
 
 
 def _runs_at_ends(
@@ -170,8 +171,8 @@ def _runs_at_ends(
     below, above = dark[dark < clear[0]], dark[dark > clear[-1]]
     runs = [(0, int(below[-1]) + 1)] if len(below) else []
     runs += [(int(above[0]), count)] if len(above) else []
-    runs = [run for run in runs if run[1] - run[0] >= _LEAST * count]
-    return runs if sum(last - first for first, last in runs) <= _MOST * count else []
+    runs = [run for run in runs if run[1] - run[0] >= _MIN_SHARE * count]
+    return runs if sum(last - first for first, last in runs) <= _MAX_SHARE * count else []
 
 
 def seen_by(
@@ -193,11 +194,11 @@ def colours_seen(
     heights = _first_points(outer, rays)[:, 2]
     found = np.full((len(heights), 3), np.nan)
     for end in ends:
-        found[(heights > end.low) & (heights < end.high)] = end.colour
+        found[heights > end.low if end.is_cap(outer) else heights < end.high] = end.colour
     return found
 
 
-def remaining(outer: Revolution, ends: Sequence[OpaqueEnd]) -> Revolution:
+def clear_part(outer: Revolution, ends: Sequence[OpaqueEnd]) -> Revolution:
     """Returns the body between its opaque ends, with flat ends where they were."""
     points, (low, high) = outer.points, _limits(outer, ends)
     kept, (bottom, top) = points, _extent(outer)
@@ -210,7 +211,7 @@ def remaining(outer: Revolution, ends: Sequence[OpaqueEnd]) -> Revolution:
         first = int(np.flatnonzero(kept[:, 1] <= low)[-1]) + 1
         rim = _at_height(kept[first - 1], kept[first], low)
         kept = np.concatenate([[[0.0, low]], rim, kept[first:]])
-    profile = Profile(walls.even(kept, _EVEN), closed=False)
+    profile = Profile(walls.even(kept, _PROFILE_POINTS), closed=False)
     return Revolution(outer.axis, profile, float(max(2.0 * kept[:, 0].max(), np.ptp(kept[:, 1]))))
 
 
@@ -235,8 +236,9 @@ def _at_height(
 
 
 def mesh_of_end(outer: Revolution, end: OpaqueEnd) -> Mesh:
-    """Returns an opaque end as a closed mesh."""
-    points = outer.points
+    """Returns an opaque end as a closed mesh; hollows in the flat faces of the body are filled."""
+    lowest, highest = (find(outer.points[:, 1]) for find in (np.argmin, np.argmax))
+    points = outer.points[lowest : highest + 1]
     inside = points[(points[:, 1] > end.low) & (points[:, 1] < end.high)]
     rims = np.stack([[inside[0, 0], end.low], [inside[-1, 0], end.high]])
     side = walls.even(np.concatenate([rims[:1], inside, rims[1:]]), _POINTS)

@@ -349,8 +349,8 @@ def inset(
       profile: profile that begins and ends on the axis.
       distance: distance, world units.
       size: diameter of the object.
-      base: least height above the lowest point of the axis, world units.
-      lid: least depth below its highest point.
+      base: least height above the lower end on the axis, world units; 0 sets none.
+      lid: least depth below the upper end; 0 sets none.
 
     Returns:
       The curve; `None` if nothing is further inside.
@@ -373,8 +373,10 @@ def inset(
     normals = profile_normals(Profile(dense, closed=False))[nearest]
     depth = np.where(np.sum(outwards * normals, axis=-1) < 0.0, away, -away) - distance
     heights = centres[..., 1].ravel()
-    between_ends = np.minimum(heights - dense[0, 1] - base, dense[-1, 1] - lid - heights)
-    depth = np.minimum(depth, between_ends)
+    if base > 0.0:
+        depth = np.minimum(depth, heights - dense[0, 1] - base)
+    if lid > 0.0:
+        depth = np.minimum(depth, dense[-1, 1] - lid - heights)
     shares = np.clip(0.5 + depth / (8.0 * cell), 0.0, 1.0).reshape(rows, columns)
     if shares.max() < 0.6:
         return None
@@ -391,8 +393,7 @@ def inset(
 def with_punt(profile: Profile, height: float) -> Profile:
     """Returns a profile with a hollow under its bottom, shaped like a dome.
 
-    Masks do not show such a hollow, since no line of sight below the rim that a body stands on
-    misses the body.
+    Masks do not show such a hollow: every line of sight into it also meets the rim around it.
 
     Args:
       profile: profile that begins and ends on the axis.

@@ -65,6 +65,13 @@ def test_the_inner_wall_follows_the_outer_one(vessel):
     np.testing.assert_allclose(np.linalg.norm(thinner, axis=-1), 0.03, atol=1e-9)
 
 
+def test_walls_that_cross_are_noticed(vessel):
+    x = vessel.start()
+    assert not vessel.surfaces_cross(x)
+    x[vessel.layout.inner] = 0.2
+    assert vessel.surfaces_cross(x)
+
+
 @pytest.mark.parametrize(
     ("interior", "message"),
     [

@@ -103,6 +103,18 @@ def test_the_number_of_faces_does_not_depend_on_the_level(body):
     assert len(counts) == 1
 
 
+@pytest.mark.parametrize("deviation", [0.0, 0.03])
+def test_a_given_index_is_kept(body, surface, small_tiles, deviation):
+    del small_tiles
+    seen = vessels.photographs(Vessel(body, Interior("air", wall=0.15), _SMALL), surface)
+    start = Interior("air", wall=0.15, glass=1.45, glass_deviation=deviation)
+    vessel = Vessel(body, start, _SMALL)
+    steps = gauss_newton.Steps((0, 0), 2048, 2048)
+    fit = gauss_newton.fit(vessel, vessel.start(), surface, seen, settings=steps)
+    assert (abs(vessel.interior(fit.x).glass - 1.45) < 1e-8) == (deviation == 0.0)
+    assert np.all(np.isfinite(fit.covariance))
+
+
 def test_levels_are_horizontal_where_they_should_be(body):
     vessel = Vessel(body, _FLASK, _TINY)
     _, liquid, air = vessel.solids(vessel.start())
@@ -141,6 +153,13 @@ def test_an_inset_keeps_away_from_both_ends():
     assert found.points[:, 1].max() == pytest.approx(0.6, abs=5e-3)
     assert found.points[:, 0].max() == pytest.approx(0.8, abs=2e-3)
     assert inset(profile, 0.2, 2.0, base=1.2, lid=0.9) is None
+
+
+def test_an_inset_follows_a_punt():
+    profile = Profile(revolved.even(revolved.cylinder(), 400), closed=False)
+    found = inset(with_punt(profile, 0.4), 0.1, 2.0).points
+    assert found[0, 1] == pytest.approx(-0.5, abs=0.02)
+    assert found[:, 1].min() < -0.8
 
 
 def test_a_punt_is_a_hollow_under_the_bottom_alone():

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from refref_jax.geometry.triangle_meshes import volume
+from refref_jax.geometry.triangle_meshes import face_vectors, is_watertight, volume
 from refref_jax.reconstruct import opaque_ends, photometry, walls
 from refref_jax.reconstruct.families import Revolution
 from refref_jax.reconstruct.mesh_distance import signed_distance
-from refref_jax.reconstruct.opaque_ends import OpaqueEnd, find_opaque_ends, remaining
+from refref_jax.reconstruct.opaque_ends import OpaqueEnd, clear_part, find_opaque_ends
 from refref_jax.reconstruct.photometry import Backdrop
 from refref_jax.reconstruct.revolution import Profile
 from refref_jax.reconstruct.shape_from_refraction import SingleObject
@@ -97,7 +97,7 @@ def test_two_ends_that_leave_little_are_none(body, surface, clear):
 def test_a_high_cap_is_no_foot(body):
     cap, foot = _cap(body, 1.7), _foot(body, 0.3)
     assert cap.is_cap(body) and not foot.is_cap(body)
-    assert remaining(body, (foot, cap)).points[:, 1].max() == pytest.approx(cap.low, abs=0.02)
+    assert clear_part(body, (foot, cap)).points[:, 1].max() == pytest.approx(cap.low, abs=0.02)
 
 
 def test_few_pixels_tell_nothing(body, surface, clear):
@@ -107,7 +107,7 @@ def test_few_pixels_tell_nothing(body, surface, clear):
 
 def test_glass_and_ends_are_apart_and_fill_the_body(body):
     ends = (_foot(body, 0.3), _cap(body, 0.4))
-    glass = remaining(body, ends)
+    glass = clear_part(body, ends)
     found = (glass.points[:, 1].min(), glass.points[:, 1].max())
     assert found == pytest.approx((ends[0].high, ends[1].low), abs=0.02)
     whole, middle = (mesh_of(each.pose(each.start())) for each in (body, glass))
@@ -129,12 +129,17 @@ def test_pixels_of_ends_are_left_out(body, clear):
 
 
 def test_without_ends_all_of_the_body_remains(body):
-    whole = remaining(body, ())
+    whole = clear_part(body, ())
     assert np.ptp(whole.points[:, 1]) == pytest.approx(np.ptp(body.points[:, 1]), abs=1e-3)
 
 
 def test_a_foot_may_be_hollow(body):
     hollow = Revolution(body.axis, walls.with_punt(Profile(body.points, closed=False), 0.5), 2.6)
     foot = _foot(hollow, 0.3)
-    glass = remaining(hollow, (foot,))
+    glass = clear_part(hollow, (foot,))
     assert glass.points[:, 1].min() == pytest.approx(foot.high, abs=0.02)
+    mesh = opaque_ends.mesh_of_end(hollow, foot)
+    areas = np.linalg.norm(face_vectors(mesh.vertices, mesh.faces), axis=-1)
+    assert is_watertight(mesh.faces) and areas.min() > 0.0
+    heights = (mesh.vertices - body.axis.point) @ body.axis.frame[:, 2]
+    assert (heights.min(), heights.max()) == pytest.approx((foot.low, foot.high), abs=1e-6)

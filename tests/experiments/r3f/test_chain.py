@@ -289,7 +289,7 @@ def _trial(name, mesh, index, errors):
     return Trial(name, SingleObject(FixedShape(mesh), index), fit, np.asarray(errors))
 
 
-_SHAPELESS = light_stage.Revolved(None)
+_SHAPELESS = light_stage.RevolvedObject(None)
 
 _VIEWS = 1e-3 * np.linspace(-1.0, 1.0, 5)
 
