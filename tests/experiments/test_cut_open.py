@@ -7,6 +7,7 @@ import trimesh
 
 from experiments.figures import cross_sections, cut_open
 from refref_jax import make_part
+from refref_jax.choices import Material
 
 _CENTRE = (0.3, -0.2, 0.1)
 
@@ -54,6 +55,15 @@ def test_a_cut_shows_the_liquid_in_its_colour_and_the_wall_behind_air(tmp_path):
     behind, solid = (_colour(tmp_path / "empty.png", column) for column in (0, 1))
     np.testing.assert_allclose(solid, (0.56, 0.67, 0.74), atol=0.01)
     assert np.ptp(behind) < 0.1 and not np.allclose(behind, solid, atol=0.05)
+
+
+def test_opaque_parts_are_filled_in_brown_and_cut_no_hole(tmp_path):
+    opaque = _ball(0.7, index=1.0, material=Material("opaque"))
+    cut_open.write(tmp_path / "opaque.png", [opaque], [_ball(1.0, index=1.5), opaque])
+    for column in (0, 1):
+        np.testing.assert_allclose(
+            _colour(tmp_path / "opaque.png", column), (0.42, 0.38, 0.36), atol=0.01
+        )
 
 
 @pytest.mark.parametrize("plane", [0.0, 5.0])

@@ -23,14 +23,18 @@ from experiments.r3f import (
 from experiments.r3f.records import ReconstructionConfig
 from refref_jax.data import meshes, scene_folder
 from refref_jax.geometry.triangle_meshes import corner_normals
+from refref_jax.reconstruct import opaque_ends
 from refref_jax.reconstruct.bubbles import Bubble, ObjectWithBubbles
+from refref_jax.reconstruct.contents import COARSE, Interior
 from refref_jax.reconstruct.gauss_newton import Fit
+from refref_jax.reconstruct.interiors import Vessel
 from refref_jax.reconstruct.mesh_distance import compare_meshes
 from refref_jax.reconstruct.model_selection import Trial
+from refref_jax.reconstruct.opaque_ends import OpaqueEnd
 from refref_jax.reconstruct.refractive_index import Descent, IndexEstimate
 from refref_jax.reconstruct.shape_from_refraction import SingleObject
-from refref_jax.reconstruct.shapes import FixedShape
-from tests.factories import bodies
+from refref_jax.reconstruct.shapes import FixedShape, mesh_of
+from tests.factories import bodies, scenes, vessels
 from tests.factories.silhouettes import RADIUS, without_masks, write_scene
 
 pytestmark = [pytest.mark.longest, pytest.mark.computing]
@@ -411,6 +415,46 @@ def test_bubbles_come_with_the_shape_that_is_chosen(scene, monkeypatch, tmp_path
     air = meshes.read_part(target.parent / facts.parts[1].mesh, index=1.0)
     radii = np.linalg.norm(air.vertices - bubble.centre, axis=-1)
     np.testing.assert_allclose(radii, bubble.radius, rtol=1e-5)
+
+
+@pytest.mark.parametrize("is_vessel", [True, False])
+def test_opaque_ends_are_parts_of_vessels_alone(scene, monkeypatch, tmp_path, is_vessel):
+    outer = vessels.bottle()
+    top, colour = float(outer.points[:, 1].max()), (0.02, 0.05, 0.3)
+    cap = OpaqueEnd(top - 0.5, top, colour)
+    whole = mesh_of(outer.pose(outer.start()))
+    masks = _trial("masks", whole, 1.35, 0.1 + _VIEWS)
+    if is_vessel:
+        model = Vessel(opaque_ends.clear_part(outer, (cap,)), Interior("air", wall=0.1), COARSE)
+    else:
+        model = SingleObject(FixedShape(whole), 1.5)
+    x = model.start()
+    chosen = Trial("the other", model, Fit(x, 1e-6 * np.eye(len(x)), ()), 0.02 + _VIEWS)
+    painted = []
+    monkeypatch.setattr(light_stage, "fit", lambda *_, **options: (masks, chosen))
+    monkeypatch.setattr(
+        light_stage, "look_at_ends", lambda *_, **options: light_stage.RevolvedObject(outer, (cap,))
+    )
+
+    def draw(path, *options):
+        path.write_bytes(b"figure")
+        painted.append(options[-1](scenes.rays([[4.0, 0.0, 1.2]], [[-1.0, 0.0, 0.0]])))
+
+    monkeypatch.setattr(light_figures, "draw", draw)
+    known, target = records.IndexFacts("estimated", 1.5, 0.01, 0.04), tmp_path / "a" / "b_glass.ply"
+    facts = light_stage.run(scene, whole, known, "surface", target, seed=0)
+    assert np.isnan(painted[0]).all() != is_vessel
+    if not is_vessel:
+        assert not facts.kept and facts.parts == () and "opaque" in facts.remark
+        return
+    files = ["b_glass_glass.ply", "b_air_air.ply", "b_cap_opaque.ply"]
+    assert [part.mesh for part in facts.parts] == files
+    assert facts.parts[-1].radiance == colour
+    part = object_source._read(target.parent, facts.parts[-1])
+    assert part.material.kind == "opaque"
+    np.testing.assert_allclose(part.radiance, np.broadcast_to(colour, part.radiance.shape))
+    glass = meshes.read_part(target.parent / files[0], index=1.5)
+    assert glass.vertices[:, 2].max() < part.vertices[:, 2].min()
 
 
 @pytest.mark.parametrize(("after", "doubted"), [(0.03, False), (0.09, True)])
