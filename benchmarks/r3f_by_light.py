@@ -75,6 +75,9 @@ _GAIN = 3.0
 # Largest errors of the level of a liquid, of its index and of its tint.
 _LEVEL, _LIQUID, _TINT = 0.015, 0.01, 0.03
 
+# Share of the radius of a part within which its level is measured.
+_NEAR_AXIS = 0.05
+
 
 class Row(NamedTuple):
     """One surface: how well it explains pixels, and how far it is from the truth."""
@@ -138,28 +141,36 @@ def _measure_inside(
     true, ours = (
         {_kind(p): p for p in each} for each in (parts, object_source.read_parts(out, found))
     )
-    print("| part | index | truth | tint | truth | absorption | truth | top | truth |")
+    print("| part | index | truth | tint | truth | absorption | truth | level | truth |")
     print("|---|---|---|---|---|---|---|---|---|")
     wrong = []
     if set(true) != set(ours):
         wrong.append(f"{name}: {sorted(ours)} were found, {sorted(true)} are there")
     for kind in sorted(set(true) & set(ours)):
         part = ours[kind]
-        tops = [float(each.vertices[:, 2].max()) for each in (part, true[kind])]
+        levels = [_level(each) for each in (part, true[kind])]
         tints = [np.asarray(each.tint) for each in (part, true[kind])]
         print(
             f"| {kind} | {part.index:.4f} | {true[kind].index:g} | {np.round(tints[0], 3)} | "
             f"{tints[1]} | {np.round(part.absorption, 3)} | {true[kind].absorption} | "
-            f"{tops[0]:.4f} | {tops[1]:.4f} |",
+            f"{levels[0]:.4f} | {levels[1]:.4f} |",
             flush=True,
         )
         within = {
             "index": abs(part.index - true[kind].index) <= _LIQUID,
             "tint": np.max(np.abs(tints[0] - tints[1])) <= _TINT,
-            "level": kind != "liquid" or abs(tops[0] - tops[1]) <= _LEVEL,
+            "level": kind != "liquid" or abs(levels[0] - levels[1]) <= _LEVEL,
         }
         wrong += [f"{name}: {what} of {kind}" for what, holds in within.items() if not holds]
     return wrong
+
+
+def _level(part: meshes.MeshPart) -> float:
+    """Returns the height of the upper surface near the axis: at the wall, a liquid rises."""
+    vertices = part.vertices
+    middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
+    radii = np.linalg.norm((vertices - middle)[:, :2], axis=-1)
+    return float(vertices[radii <= _NEAR_AXIS * radii.max(), 2].max())
 
 
 def _kind(part: meshes.MeshPart) -> str:

@@ -53,7 +53,7 @@ from refref_jax.reconstruct.interiors import Solid, Vessel
 from refref_jax.reconstruct.masks import Views
 from refref_jax.reconstruct.model_selection import Trial
 from refref_jax.reconstruct.opaque_ends import OpaqueEnd
-from refref_jax.reconstruct.outlines import Outlines
+from refref_jax.reconstruct.outlines import Outlines, fit_profile
 from refref_jax.reconstruct.photometry import Backdrop, Photographs
 from refref_jax.reconstruct.refinement import objection
 
@@ -136,7 +136,7 @@ def run(
         reason = "the background is a field, not a surface at a known place"
         return LightFacts(kept=False, index=known.index, remark=reason)
     seen = read(scene, seed=seed)
-    revolved = look_at_ends(mesh, surface, seen, seed=seed)
+    revolved = look_at_ends(scene, mesh, surface, seen, seed=seed)
     trials = fit(scene, mesh, known, surface, seen, revolved, seed=seed)
     masks, chosen, remark = choose(scene, mesh, trials)
     if revolved.ends and chosen is not masks and not isinstance(chosen.model, Vessel):
@@ -249,11 +249,20 @@ def read(scene: Path, *, seed: int) -> Seen:
     return Seen(fitted.chosen(np.flatnonzero(~held)), fitted.chosen(some), "train")
 
 
-def look_at_ends(mesh: Mesh, surface: Backdrop, seen: Seen, *, seed: int) -> RevolvedObject:
+def read_views(scene: Path) -> Views:
+    """Returns the masks of the training views, with their cameras."""
+    frames = scene_folder.read_frames(scene, "train")
+    return Views(scene_folder.read_masks(frames), frames.cameras)
+
+
+def look_at_ends(
+    scene: Path, mesh: Mesh, surface: Backdrop, seen: Seen, *, seed: int
+) -> RevolvedObject:
     """Returns the object as a body of revolution, if it is one, with its opaque ends."""
     outer = families.fit_revolution(mesh, furthest=_FURTHEST)
     if outer is None:
         return RevolvedObject(None)
+    outer = fit_profile(outer, Outlines(read_views(scene), seed=seed))
     ends = opaque_ends.find_opaque_ends(outer, surface, seen.fitted, seed=seed)
     return RevolvedObject(outer, ends)
 
@@ -282,8 +291,7 @@ def fit(
       revolved: the object as a body of revolution (`look_at_ends`).
       seed: random seed.
     """
-    frames = scene_folder.read_frames(scene, "train")
-    views = Views(scene_folder.read_masks(frames), frames.cameras)
+    views = read_views(scene)
     outer, seen = _between_ends(revolved, seen)
     options = {} if known.source == "estimated" else {"deviation": 0.0}
     with ProgressBar("light", 100) as bar:

@@ -26,6 +26,7 @@ from refref_jax.reconstruct.revolution import (
     Curve,
     Fit,
     Profile,
+    even_profile,
     find_axis,
     fit_axis_and_profile,
     lathe,
@@ -224,11 +225,23 @@ class Revolution:
         turned = self.profile(unknowns)
         return place_on_axis(turned, self._lathe, _AROUND_AXIS, self.axis, unknowns[:4])
 
-    def prior(self, unknowns: Unknowns) -> tuple[Matrix, Unknowns]:
+    def moved(self, unknowns: Unknowns) -> "Revolution":
+        """Returns the body at given unknowns, at rest."""
+        frame = self.axis.frame
+        axis = Axis(self.axis.point + frame[:, :2] @ unknowns[2:4], frame @ tilt(unknowns[:2])[0])
+        profile = even_profile(Profile(self.profile(unknowns).points, self.closed), self._size)
+        return Revolution(axis, profile, self._size)
+
+    def prior(self, unknowns: Unknowns, *, bend: float = _BEND) -> tuple[Matrix, Unknowns]:
         """Returns the prior: a small change of the axis, small offsets, and smaller bends.
 
-        Standard deviations are 0.02 radians and 1 % of the diameter for the axis, 0.8 % for an
-        offset, and 0.4 % for the second difference of three neighbours.
+        Standard deviations are 0.02 radians and 1 % of the diameter for the axis, and 0.8 % for an
+        offset.
+
+        Args:
+          unknowns: the unknowns.
+          bend: standard deviation of the second difference of three neighbouring offsets, as a
+            share of the diameter.
         """
         bends = np.diff(np.eye(_KNOTS), 2, axis=0)
         if self.closed:
@@ -236,7 +249,7 @@ class Revolution:
             bends += np.roll(np.eye(_KNOTS), -1, axis=0)
         deviations = [_ANGLE, _LENGTH * self._size, _OFFSET * self._size]
         precision = np.diag(np.repeat(deviations, [2, 2, _KNOTS]) ** -2.0)
-        precision[4:, 4:] += bends.T @ bends / (_BEND * self._size) ** 2
+        precision[4:, 4:] += bends.T @ bends / (bend * self._size) ** 2
         return precision, precision @ unknowns
 
     def scales(self) -> Unknowns:

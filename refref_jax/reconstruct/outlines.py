@@ -6,6 +6,10 @@ be there. A point of this rim that moves by `dx` moves its image across the edge
 nothing. Masks are sampled at the centres of pixels, so the distance of a point has an error of
 about a third of a pixel. Masks that are wrong, or show something else, lose their weight.
 
+`fit_profile` fits a body of revolution to outlines alone. A mesh from masks is up to half a pixel
+too narrow and has waves along its profile; the outlines of all views together determine it to some
+hundredths of a pixel, and its normals to half a degree.
+
 Source: Cipolla and Blake, Surface Shape from the Deformation of Apparent Contours (1992), for the
 derivative; its use beside refraction is ours.
 """
@@ -18,6 +22,7 @@ from jaxtyping import Float, Int
 
 from refref_jax.geometry.cameras import Cameras, project
 from refref_jax.geometry.triangle_meshes import unit_vectors
+from refref_jax.reconstruct.families import Revolution
 from refref_jax.reconstruct.gauss_newton import Candidate, Rows
 from refref_jax.reconstruct.masks import Views, signed_distances
 from refref_jax.reconstruct.shapes import Posed
@@ -28,6 +33,10 @@ _DEVIATION, _WRONG, _FURTHEST = 0.3, 1.0, 3.0
 
 # Largest number of rim points per view: neighbours have the same error, so more add nothing.
 _POINTS = 100
+
+# Steps of the fit of a profile, and the standard deviation of the second differences of its knots,
+# as a share of the diameter: neighbouring points have errors that are alike.
+_ROUNDS, _BEND = 5, 0.001
 
 
 class _Rim(NamedTuple):
@@ -63,7 +72,10 @@ class Outlines:
 
     def __call__(self, candidate: Candidate) -> Rows:
         """Returns the equations of the outline of the first part, which contains all others."""
-        part = candidate.parts[0]
+        return self.of_surface(candidate.parts[0])
+
+    def of_surface(self, part: Posed) -> Rows:
+        """Returns the equations of the outline of a surface."""
         normals = _vertex_normals(part)
         edges = _edges(part.faces)
         generator = np.random.default_rng(self._seed)
@@ -105,6 +117,23 @@ class Outlines:
         entries = (blocks.ravel() / _DEVIATION, (row, at.ravel()))
         matrix = scipy.sparse.coo_array(entries, shape=(len(near), columns)).tocsr()
         return distance[near] / _DEVIATION, matrix
+
+
+def fit_profile(outer: Revolution, outlines: Outlines) -> Revolution:
+    """Fits a body of revolution to outlines alone.
+
+    Args:
+      outer: a body near the outlines, such as that of a mesh from masks.
+      outlines: the outlines.
+    """
+    x = outer.start()
+    for _ in range(_ROUNDS):
+        rows = outlines.of_surface(outer.pose(x))
+        weighted = rows.weights[:, None] * rows.derivatives
+        precision, gradient = outer.prior(x, bend=_BEND)
+        matrix = weighted.T @ rows.derivatives + precision
+        x = x - np.linalg.solve(matrix, weighted.T @ rows.errors + gradient)
+    return outer.moved(x)
 
 
 def _vertex_normals(part: Posed) -> Float[np.ndarray, "vertices 3"]:

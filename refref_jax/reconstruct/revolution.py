@@ -356,8 +356,8 @@ def _loop(points: Curve, closed: bool) -> Float[np.ndarray, "loop 2"]:
     return points if closed else np.concatenate([points, points[-2:0:-1] * [-1.0, 1.0]])
 
 
-def _even(profile: Profile, size: float) -> Profile:
-    """Returns a profile in even steps."""
+def even_profile(profile: Profile, size: float) -> Profile:
+    """Returns a profile in even steps, which depend on the diameter of the body."""
     points = profile.points
     if profile.closed:
         points = np.concatenate([points, points[:1]])
@@ -369,7 +369,7 @@ def _even(profile: Profile, size: float) -> Profile:
 
 def _smooth(profile: Profile, deviation: float, size: float) -> Profile:
     """Returns a profile smoothed along its length by a Gaussian; the poles stay on the axis."""
-    even = _even(profile, size)
+    even = even_profile(profile, size)
     loop = _loop(even.points, even.closed)
     smooth = gaussian_filter1d(loop, deviation / (_STEP * size), axis=0, mode="wrap")
     points = smooth[: len(even.points)]
@@ -436,7 +436,7 @@ def _corrected(profile: Profile, match: _Match, deviation: float, size: float) -
     points = profile.points + shift[:, None] * profile_normals(profile)
     if not profile.closed:
         points[[0, -1], 0] = 0.0
-    return _even(Profile(points, profile.closed), size)
+    return even_profile(Profile(points, profile.closed), size)
 
 
 def _corrected_axis(axis: Axis, match: _Match, size: float) -> Axis:

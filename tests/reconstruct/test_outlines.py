@@ -7,10 +7,11 @@ from scipy.ndimage import binary_dilation
 from refref_jax.optics.interface_rules import NO_PARENT, nested
 from refref_jax.reconstruct import gauss_newton
 from refref_jax.reconstruct import outlines as outlines_module
-from refref_jax.reconstruct.families import Sphere
+from refref_jax.reconstruct.families import Revolution, Sphere
 from refref_jax.reconstruct.gauss_newton import Candidate, Equations, Rows
 from refref_jax.reconstruct.masks import Views
-from refref_jax.reconstruct.outlines import Outlines
+from refref_jax.reconstruct.outlines import Outlines, fit_profile
+from refref_jax.reconstruct.revolution import Axis, Profile
 from refref_jax.reconstruct.shape_from_refraction import SingleObject
 from refref_jax.reconstruct.shapes import FixedShape, FreeSurface
 from tests.factories import bodies
@@ -119,3 +120,32 @@ def test_inner_parts_have_no_outline(outlines):
         outer.by_tints,
     )
     np.testing.assert_array_equal(outlines(both).errors, outlines(outer).errors)
+
+
+def _waisted(points):
+    """Less than the distance from a body of revolution about z."""
+    radius = np.hypot(points[..., 0], points[..., 1])
+    return 0.6 * (np.hypot(radius, points[..., 2]) - 0.9 - 0.05 * np.cos(3.0 * points[..., 2]))
+
+
+def test_outlines_alone_determine_the_profile_of_a_body_of_revolution():
+    cameras = bodies.cameras_around(24, size=120, distance=3.0)
+    views = Views(bodies.masks_of(_waisted, cameras, steps=120), cameras)
+    angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 200)
+    # Like a mesh from masks: too narrow, with waves, and off the axis.
+    rough = 0.88 + 0.01 * np.cos(6.0 * angle)
+    points = rough[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    points[[0, -1], 0] = 0.0
+    axis = Axis(np.array([0.01, -0.01, 0.0]), np.eye(3))
+    outer = Revolution(axis, Profile(points, closed=False), 2.0)
+    found = fit_profile(outer, Outlines(views))
+    np.testing.assert_allclose(found.axis.point[:2], 0.0, atol=2e-3)
+    assert found.axis.frame[2, 2] == pytest.approx(1.0, abs=1e-4)
+    off = _radial_errors(found.points + np.array([0.0, found.axis.point[2]]))
+    assert np.abs(off).max() < 0.01 < 0.02 < np.abs(_radial_errors(outer.points)).max()
+    assert np.sqrt(np.mean(off**2)) < 0.004
+
+
+def _radial_errors(points):
+    """Radial distances of points of a profile from the body of `_waisted`."""
+    return np.linalg.norm(points, axis=-1) - 0.9 - 0.05 * np.cos(3.0 * points[:, 1])
