@@ -170,7 +170,8 @@ def _level(part: meshes.MeshPart) -> float:
     vertices = part.vertices
     middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
     radii = np.linalg.norm((vertices - middle)[:, :2], axis=-1)
-    return float(vertices[radii <= _NEAR_AXIS * radii.max(), 2].max())
+    near = radii <= max(_NEAR_AXIS * radii.max(), radii.min())
+    return float(vertices[near, 2].max())
 
 
 def _kind(part: meshes.MeshPart) -> str:

@@ -149,3 +149,28 @@ def test_outlines_alone_determine_the_profile_of_a_body_of_revolution():
 def _radial_errors(points):
     """Radial distances of points of a profile from the body of `_waisted`."""
     return np.linalg.norm(points, axis=-1) - 0.9 - 0.05 * np.cos(3.0 * points[:, 1])
+
+
+def test_a_ring_is_fitted_to_its_outlines():
+    cameras = bodies.cameras_around(24, size=120, distance=3.0)
+    views = Views(
+        bodies.masks_of(lambda p: bodies.torus(p, large=0.7, small=0.3), cameras), cameras
+    )
+    angle = np.linspace(0.0, 2.0 * np.pi, 160, endpoint=False)
+    points = [0.7, 0.0] + 0.28 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    ring = Revolution(Axis(_ORIGIN, np.eye(3)), Profile(points, closed=True), 2.0)
+    found = fit_profile(ring, Outlines(views))
+    assert found.closed
+    tube = np.linalg.norm(found.points - [0.7, -found.axis.point[2]], axis=-1)
+    # Its innermost part is no outline in most views.
+    outside = found.points[:, 0] > 0.7
+    assert np.abs(tube[outside] - 0.3).max() < 0.01
+
+
+def test_a_profile_far_from_all_outlines_stays_as_it_is(outlines):
+    angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 200)
+    points = 0.5 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    points[[0, -1], 0] = 0.0
+    small = Revolution(Axis(_ORIGIN, np.eye(3)), Profile(points, closed=False), 1.0)
+    found = fit_profile(small, outlines)
+    np.testing.assert_allclose(np.linalg.norm(found.points, axis=-1), 0.5, atol=1e-3)
