@@ -6,10 +6,14 @@ import pytest
 from refref_jax.reconstruct import ReconstructionError
 from refref_jax.reconstruct.families import candidates
 from refref_jax.reconstruct.revolution import Axis, Profile
-from refref_jax.reconstruct.segments import even_samples, find_corners, straight_pieces
 from refref_jax.reconstruct.shapes import frame_along, mesh_of
 from refref_jax.reconstruct.turned import StraightTurned, rounded, sampled
-from refref_jax.reconstruct.turned_fit import fit_turned
+from refref_jax.reconstruct.turned_fit import (
+    even_samples,
+    find_corners,
+    fit_turned,
+    straight_pieces,
+)
 from tests.factories import bodies, revolved
 from tests.laws import posed_surfaces
 
