@@ -31,7 +31,7 @@ from refref_jax import atomic_files
 from refref_jax.choices import CLEAR, Split
 from refref_jax.data import meshes, scene_folder
 from refref_jax.geometry.rays import Rays
-from refref_jax.geometry.triangle_meshes import Mesh, face_vectors, volume
+from refref_jax.geometry.triangle_meshes import Mesh, diameter, face_vectors, volume
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.optics.media import INDEX_OF_AIR
 from refref_jax.reconstruct import (
@@ -56,6 +56,7 @@ from refref_jax.reconstruct.opaque_ends import OpaqueEnd
 from refref_jax.reconstruct.outlines import Outlines, fit_profile
 from refref_jax.reconstruct.photometry import Backdrop, Photographs
 from refref_jax.reconstruct.refinement import objection
+from refref_jax.reconstruct.relief import measure_relief
 
 FOLDER = "light"
 
@@ -262,7 +263,8 @@ def look_at_ends(
     outer = families.fit_revolution(mesh, furthest=_FURTHEST)
     if outer is None:
         return RevolvedObject(None)
-    outer = fit_profile(outer, Outlines(read_views(scene), seed=seed))
+    relief = measure_relief(mesh, outer.axis, diameter(mesh.vertices))
+    outer = fit_profile(outer, Outlines(read_views(scene), seed=seed), relief=relief)
     ends = opaque_ends.find_opaque_ends(outer, surface, seen.fitted, seed=seed)
     return RevolvedObject(outer, ends)
 

@@ -10,6 +10,7 @@ All fits are equivariant: a mesh that is moved and scaled has the same fit, move
 Sources: Pottmann and Randrup (1998) for axes, see `revolution`; the rest is ours.
 """
 
+import copy
 from collections.abc import Callable
 
 import numpy as np
@@ -21,6 +22,7 @@ from trimesh.creation import icosphere
 
 from refref_jax.geometry.triangle_meshes import Mesh, diameter
 from refref_jax.reconstruct.polyhedra import fit_polyhedron
+from refref_jax.reconstruct.relief import Relief
 from refref_jax.reconstruct.revolution import (
     Axis,
     Curve,
@@ -184,13 +186,17 @@ class Revolution:
       points: profile of the fit, relative to the point of the axis.
       directions: its outward normals.
       closed: whether the profile is closed.
+      relief: how the surface differs from one of revolution, if it does.
     """
 
     name = "surface of revolution"
 
-    def __init__(self, axis: Axis, profile: Profile, size: float) -> None:
-        """Takes the axis, its profile in even steps, and the diameter of the body."""
+    def __init__(
+        self, axis: Axis, profile: Profile, size: float, relief: Relief | None = None
+    ) -> None:
+        """Takes the axis, its profile in even steps, the diameter of the body, and its relief."""
         self.axis, self.closed, self._size = axis, profile.closed, size
+        self.relief = relief
         at, length = _places(profile, _ALONG_PROFILE)
         knots, _ = _places(profile, _KNOTS)
         self.points = _between_knots(profile, knots)(at)
@@ -223,14 +229,22 @@ class Revolution:
     def pose(self, unknowns: Unknowns) -> Posed:
         """Returns the body; its vertices lie on the spline."""
         turned = self.profile(unknowns)
-        return place_on_axis(turned, self._lathe, _AROUND_AXIS, self.axis, unknowns[:4])
+        return place_on_axis(
+            turned, self._lathe, _AROUND_AXIS, self.axis, unknowns[:4], relief=self.relief
+        )
 
     def moved(self, unknowns: Unknowns) -> "Revolution":
         """Returns the body at given unknowns, at rest."""
         frame = self.axis.frame
         axis = Axis(self.axis.point + frame[:, :2] @ unknowns[2:4], frame @ tilt(unknowns[:2])[0])
         profile = even_profile(Profile(self.profile(unknowns).points, self.closed), self._size)
-        return Revolution(axis, profile, self._size)
+        return Revolution(axis, profile, self._size, self.relief)
+
+    def with_relief(self, relief: Relief | None) -> "Revolution":
+        """Returns the body with another relief."""
+        found = copy.copy(self)
+        found.relief = relief
+        return found
 
     def prior(self, unknowns: Unknowns, *, bend: float = _BEND) -> tuple[Matrix, Unknowns]:
         """Returns the prior: a small change of the axis, small offsets, and smaller bends.

@@ -323,7 +323,8 @@ class Vessel:
         """Returns a profile turned around the axis, with columns for all unknowns."""
         shift, azimuths = np.append(x[:4], 0.0), self.detail.azimuths
         connected = lathe(outline.poles, outline.segments, outline.ends, azimuths)
-        posed = place(outline.turned, connected, azimuths, self.outer.axis, shift)
+        axis, relief = self.outer.axis, self.outer.relief
+        posed = place(outline.turned, connected, azimuths, axis, shift, relief=relief)
 
         def columns(matrix: np.ndarray) -> np.ndarray:
             # A shift along the axis is an offset of the profile.

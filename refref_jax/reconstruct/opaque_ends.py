@@ -212,7 +212,8 @@ def clear_part(outer: Revolution, ends: Sequence[OpaqueEnd]) -> Revolution:
         rim = _at_height(kept[first - 1], kept[first], low)
         kept = np.concatenate([[[0.0, low]], rim, kept[first:]])
     profile = Profile(walls.even(kept, _PROFILE_POINTS), closed=False)
-    return Revolution(outer.axis, profile, float(max(2.0 * kept[:, 0].max(), np.ptp(kept[:, 1]))))
+    size = float(max(2.0 * kept[:, 0].max(), np.ptp(kept[:, 1])))
+    return Revolution(outer.axis, profile, size, outer.relief)
 
 
 def _limits(outer: Revolution, ends: Sequence[OpaqueEnd]) -> tuple[float, float]:
@@ -250,4 +251,6 @@ def mesh_of_end(outer: Revolution, end: OpaqueEnd) -> Mesh:
     top = walls.disc(stretch.last(), float(side[-1, 1]), nothing)
     outline: Outline = walls.joined([bottom, stretch, top])
     connected = lathe(outline.poles, outline.segments, outline.ends, _AZIMUTHS)
-    return mesh_of(place(outline.turned, connected, _AZIMUTHS, outer.axis, np.zeros(5)))
+    return mesh_of(
+        place(outline.turned, connected, _AZIMUTHS, outer.axis, np.zeros(5), relief=outer.relief)
+    )

@@ -25,6 +25,7 @@ from refref_jax.geometry.triangle_meshes import unit_vectors
 from refref_jax.reconstruct.families import Revolution
 from refref_jax.reconstruct.gauss_newton import Candidate, Rows
 from refref_jax.reconstruct.masks import Views, signed_distances
+from refref_jax.reconstruct.relief import Relief
 from refref_jax.reconstruct.shapes import Posed
 
 # Standard deviation of a signed distance, and the distance at which a point has lost half of its
@@ -37,6 +38,9 @@ _POINTS = 100
 # Steps of the fit of a profile, and the standard deviation of the second differences of its knots,
 # as a share of the diameter: neighbouring points have errors that are alike.
 _ROUNDS, _BEND = 5, 0.001
+
+# Largest error of a body with a relief, as a share of that of the body without it.
+_BETTER = 0.95
 
 
 class _Rim(NamedTuple):
@@ -119,13 +123,26 @@ class Outlines:
         return distance[near] / _DEVIATION, matrix
 
 
-def fit_profile(outer: Revolution, outlines: Outlines) -> Revolution:
+def fit_profile(
+    outer: Revolution, outlines: Outlines, *, relief: Relief | None = None
+) -> Revolution:
     """Fits a body of revolution to outlines alone.
 
     Args:
       outer: a body near the outlines, such as that of a mesh from masks.
       outlines: the outlines.
+      relief: how the body may differ from one of revolution. It gets this relief only if the
+        outlines are explained better by it: meshes from masks have such a relief in hollows, too.
     """
+    found = _fitted(outer.with_relief(None), outlines)
+    if relief is None:
+        return found
+    raised = _fitted(found.with_relief(relief), outlines)
+    better = _error(raised, outlines) < _BETTER * _error(found, outlines)
+    return raised if better else found
+
+
+def _fitted(outer: Revolution, outlines: Outlines) -> Revolution:
     x = outer.start()
     for _ in range(_ROUNDS):
         rows = outlines.of_surface(outer.pose(x))
@@ -134,6 +151,12 @@ def fit_profile(outer: Revolution, outlines: Outlines) -> Revolution:
         matrix = weighted.T @ rows.derivatives + precision
         x = x - np.linalg.solve(matrix, weighted.T @ rows.errors + gradient)
     return outer.moved(x)
+
+
+def _error(outer: Revolution, outlines: Outlines) -> float:
+    """Returns the mean distance from the outlines, in standard deviations, up to the largest."""
+    errors = outlines.of_surface(outer.pose(outer.start())).errors
+    return float(np.mean(np.minimum(np.abs(errors), _WRONG / _DEVIATION)))
 
 
 def _vertex_normals(part: Posed) -> Float[np.ndarray, "vertices 3"]:

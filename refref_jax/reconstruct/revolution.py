@@ -257,7 +257,7 @@ def section(mesh: Mesh, axis: Axis, size: float) -> Section:
     bottom = float(local[:, 2].min()) - _MARGIN * cell
     rows = int((local[:, 2].max() - bottom) / cell) + _MARGIN
     columns = int(np.linalg.norm(local[:, :2], axis=-1).max() / cell) + _MARGIN
-    start, end, row = _cuts(local, mesh.faces, bottom, cell)
+    start, end, row = slice_faces(local, mesh.faces, bottom, cell)
     total = np.zeros(rows * (columns + 1))
     for piece in range(_PIECES):
         one, two = (start + (piece + i) / _PIECES * (end - start) for i in (0, 1))
@@ -273,7 +273,7 @@ def section(mesh: Mesh, axis: Axis, size: float) -> Section:
     return Section(shares[:, 1:], bottom, cell)
 
 
-def _cuts(
+def slice_faces(
     local: Float[np.ndarray, "vertices 3"],
     faces: Int[np.ndarray, "faces 3"],
     bottom: float,

@@ -6,15 +6,17 @@ square section. A dozen numbers describe each exactly, where a spline of many kn
 Source: ours.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
+from refref_jax.reconstruct.relief import Relief
 from refref_jax.reconstruct.revolution import Axis, Curve, Lathe, lathe, sweep
 from refref_jax.reconstruct.shapes import (
     LARGEST_STEP,
     LARGEST_TURN,
+    Frame,
     Matrix,
     Posed,
     Unknowns,
@@ -39,6 +41,10 @@ _POWER = 8
 _DIFFERENCE = 1e-6
 
 
+# Points or directions in space, and their derivatives.
+_Swept: TypeAlias = tuple[np.ndarray, np.ndarray]
+
+
 class Turned(NamedTuple):
     """A profile and its derivatives by m unknowns.
 
@@ -56,7 +62,13 @@ class Turned(NamedTuple):
 
 
 def place(
-    turned: Turned, connected: Lathe, azimuths: int, axis: Axis, pose: Float[np.ndarray, "5"]
+    turned: Turned,
+    connected: Lathe,
+    azimuths: int,
+    axis: Axis,
+    pose: Float[np.ndarray, "5"],
+    *,
+    relief: Relief | None = None,
 ) -> Posed:
     """Turns a profile around an axis that is tilted and shifted.
 
@@ -66,21 +78,26 @@ def place(
       azimuths: number of half-planes.
       axis: axis at rest.
       pose: two angles of the tilt, and the shift in the frame of the axis.
+      relief: relief of the surface, which moves with the axis.
 
     Returns:
       The surface; unknowns are the pose and then those of the profile.
     """
     rotations = [axis.frame @ rotation for rotation in tilt(pose[:2])]
+    points = sweep(turned.points, turned.by_points, rotations[0], azimuths)
+    directions = sweep(turned.normals, turned.by_normals, rotations[0], azimuths)
+    if relief is not None:
+        at_normals = _rows_at_normals(connected, len(directions[0]), azimuths)
+        points, directions = _raised(points, directions, at_normals, rotations[0], relief)
 
-    def turn(values: Curve, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        swept, moved = sweep(values, slopes, rotations[0], azimuths)
+    def turn(swept: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         local = swept @ rotations[0]
         tilted = np.stack([local @ rotation.T for rotation in rotations[1:]], axis=-1)
         return swept, np.concatenate([tilted, np.zeros((*swept.shape, 3)), moved], axis=-1)
 
-    vertices, by_vertices = turn(turned.points, turned.by_points)
+    vertices, by_vertices = turn(*points)
     by_vertices[..., 2:5] = axis.frame
-    normals, by_normals = turn(turned.normals, turned.by_normals)
+    normals, by_normals = turn(*directions)
     rows = connected.rows
     return Posed(
         axis.point + axis.frame @ pose[2:] + vertices[rows],
@@ -92,14 +109,49 @@ def place(
     )
 
 
+def _rows_at_normals(connected: Lathe, count: int, azimuths: int) -> Int[np.ndarray, " normals"]:
+    """Returns the row of the swept points at which each normal is."""
+    found = np.zeros(count, np.int64)
+    found[connected.normal_ids] = connected.rows[connected.faces]
+    # A pole is a vertex only once, but has normals of all azimuths.
+    return azimuths * (found // azimuths) + np.arange(count) % azimuths
+
+
+def _raised(
+    points: _Swept,
+    normals: _Swept,
+    at_normals: Int[np.ndarray, " normals"],
+    frame: Frame,
+    relief: Relief,
+) -> tuple[_Swept, _Swept]:
+    """Returns points and normals with a relief; normals turn as those of a stretched surface.
+
+    That the stretching at a normal changes with the unknowns is left out of its derivatives.
+    """
+    stretched = relief.stretch(points[0] @ frame)
+    jacobian = frame @ stretched.jacobian @ frame.T
+    turn = np.linalg.inv(jacobian)[at_normals].swapaxes(1, 2)
+    turned = np.einsum("nij,nj->ni", turn, normals[0])
+    length = np.linalg.norm(turned, axis=-1)[:, None]
+    unit, moved = turned / length, turn @ normals[1] / length[..., None]
+    moved -= unit[..., None] * np.sum(unit[..., None] * moved, axis=1)[:, None]
+    return (stretched.points @ frame.T, jacobian @ points[1]), (unit, moved)
+
+
 def place_on_axis(
-    turned: Turned, connected: Lathe, azimuths: int, axis: Axis, pose: Float[np.ndarray, "4"]
+    turned: Turned,
+    connected: Lathe,
+    azimuths: int,
+    axis: Axis,
+    pose: Float[np.ndarray, "4"],
+    *,
+    relief: Relief | None = None,
 ) -> Posed:
     """Does what `place` does if the unknowns of the profile shift it along the axis already.
 
     Its pose is two angles, and the shift along the two directions across the axis.
     """
-    posed = place(turned, connected, azimuths, axis, np.append(pose, 0.0))
+    posed = place(turned, connected, azimuths, axis, np.append(pose, 0.0), relief=relief)
     return posed._replace(
         by_vertices=np.delete(posed.by_vertices, 4, axis=1),
         by_normals=np.delete(posed.by_normals, 4, axis=1),

@@ -1,0 +1,157 @@
+"""Vessels that are turned only in part: feet with six sides, spouts and flutes."""
+
+import numpy as np
+import pytest
+
+from refref_jax.geometry.triangle_meshes import (
+    diameter,
+    face_normals,
+    face_vectors,
+    make_mesh,
+    unit_vectors,
+)
+from refref_jax.reconstruct.contents import Detail, Interior
+from refref_jax.reconstruct.families import Revolution, fit_revolution
+from refref_jax.reconstruct.interiors import Vessel
+from refref_jax.reconstruct.masks import Views
+from refref_jax.reconstruct.mesh_distance import signed_distance
+from refref_jax.reconstruct.outlines import Outlines, fit_profile
+from refref_jax.reconstruct.relief import Relief, measure_relief
+from refref_jax.reconstruct.revolution import Axis, Profile
+from tests.factories import bodies, revolved, vessels
+from tests.laws import posed_surfaces
+
+_UPRIGHT = Axis(np.zeros(3), np.eye(3))
+
+
+def _six_sided(points, *, below=-0.4):
+    """Factors that give a body of revolution about z a foot with six rounded sides."""
+    azimuth = np.arctan2(points[..., 1], points[..., 0])
+    foot = 0.5 - 0.5 * np.tanh((points[..., 2] - below) / 0.1)
+    factor = 1.0 + 0.08 * foot * np.cos(6.0 * azimuth)
+    return np.stack([factor, factor, np.ones_like(factor)], axis=-1)
+
+
+def _stretched(mesh):
+    return make_mesh(mesh.vertices * _six_sided(mesh.vertices), mesh.faces)
+
+
+@pytest.fixture(scope="module")
+def foot():
+    """A cylinder whose foot has six sides, as a mesh with the noise of masks."""
+    profile = revolved.even(revolved.cylinder(), 160)
+    return revolved.noisy(_stretched(revolved.revolve(profile, azimuths=128)), 0.001)
+
+
+@pytest.fixture(scope="module")
+def relief(foot):
+    return measure_relief(foot, _UPRIGHT, diameter(foot.vertices))
+
+
+def test_the_relief_of_a_foot_with_six_sides_is_measured(foot, relief):
+    heights = relief.low + relief.step * np.arange(len(relief.factors))
+    azimuth = 2.0 * np.pi * np.arange(relief.factors.shape[1]) / relief.factors.shape[1]
+    around = np.stack(np.broadcast_arrays(np.cos(azimuth), np.sin(azimuth), heights[:, None]), -1)
+    expected = _six_sided(around)[..., 0] - 1.0
+    middle = np.abs(heights) < 0.85
+    np.testing.assert_allclose(relief.factors[middle], expected[middle], atol=0.006)
+    assert not relief.factors[np.abs(heights - 0.3) < 0.5].any(), "round sections stay round"
+
+
+def test_a_round_mesh_has_no_relief():
+    mesh = revolved.noisy(revolved.revolve(revolved.even(revolved.vase(), 200)), 0.001)
+    assert measure_relief(mesh, _UPRIGHT, diameter(mesh.vertices)) is None
+
+
+def test_a_moved_and_scaled_mesh_has_the_same_relief(foot, relief):
+    moved = revolved.placed(foot, offset=np.array([1e3, -2e3, 5e2]), scale=10.0)
+    axis = Axis(np.array([1e3, -2e3, 5e2]), np.eye(3))
+    found = measure_relief(moved, axis, diameter(moved.vertices))
+    np.testing.assert_allclose(found.factors, relief.factors, atol=1e-9)
+    assert found.step == pytest.approx(10.0 * relief.step)
+
+
+def test_the_jacobian_is_that_of_the_stretched_points(relief):
+    points = np.random.default_rng(0).uniform(-0.8, 0.8, size=(200, 3))
+    found, step = relief.stretch(points), 1e-6
+    for axis, change in enumerate(step * np.eye(3)):
+        after, before = relief.stretch(points + change), relief.stretch(points - change)
+        slope = (after.points - before.points) / (2.0 * step)
+        np.testing.assert_allclose(found.jacobian[..., axis], slope, atol=1e-6)
+
+
+def test_points_on_the_axis_and_beyond_both_ends_stay_finite(relief):
+    points = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -50.0], [1e-300, 0.0, 9.0], [1e6, 0.0, 0.0]])
+    found = relief.stretch(points)
+    assert np.isfinite(found.points).all() and np.isfinite(found.jacobian).all()
+    np.testing.assert_array_equal(found.points[:2], points[:2])
+
+
+def test_normals_are_perpendicular_to_the_stretched_surface(foot, relief):
+    outer = fit_revolution(foot, furthest=0.05).with_relief(relief)
+    posed = outer.pose(outer.start())
+    corners = posed.vertices[posed.faces]
+    flat = face_normals(corners)
+    large = np.linalg.norm(face_vectors(posed.vertices, posed.faces), axis=-1) > 1e-6
+    smooth = unit_vectors(posed.normals[posed.normal_ids].mean(axis=1))
+    angle = np.degrees(np.arccos(np.clip(np.sum(flat * smooth, axis=-1), -1.0, 1.0)))[large]
+    # Half-planes are 2.8 degrees apart, and the normals of the foot turn four times as fast.
+    assert np.median(angle) < 0.8 and np.quantile(angle, 0.99) < 3.5
+
+
+def test_vertices_move_as_their_derivatives_say(foot, relief):
+    outer = fit_revolution(foot, furthest=0.05).with_relief(relief)
+    generator, x = np.random.default_rng(1), outer.start()
+    step = 1e-6 * generator.normal(size=len(x))
+    after, before, now = outer.pose(x + step), outer.pose(x - step), outer.pose(x)
+    moved = 0.5 * (after.vertices - before.vertices).ravel()
+    np.testing.assert_allclose(moved, now.by_vertices @ step, atol=1e-3 * np.abs(moved).max())
+    turned = 0.5 * (after.normals - before.normals).ravel()
+    wrong = np.linalg.norm(turned - now.by_normals @ step) / np.linalg.norm(turned)
+    assert wrong < 0.1
+
+
+def test_parts_of_a_vessel_with_a_relief_are_closed_and_nested(relief):
+    body = vessels.bottle()
+    body = body.with_relief(Relief(-1.0, 2.0 / (len(relief.factors) - 1), relief.factors))
+    detail = Detail(outer=48, inner=64, azimuths=48)
+    for mouth in (False, True):
+        interior = Interior("liquid and air", mouth=mouth, wall=0.12, level=-0.2, gap=0.05)
+        vessel = Vessel(body, interior, detail)
+        for part in vessel.pose(vessel.start()).parts[: 2 if mouth else 3]:
+            posed_surfaces.assert_closed(part)
+        solids = vessel.solids(vessel.start())
+        liquid = solids[1].mesh
+        assert signed_distance(solids[0].mesh)(liquid.vertices).max() < 0.0
+        round_one = Vessel(body.with_relief(None), interior, detail)
+        plain = round_one.solids(round_one.start())[1].mesh
+        assert np.ptp(liquid.vertices - plain.vertices) > 0.01
+        np.testing.assert_array_equal(liquid.vertices[:, 2], plain.vertices[:, 2])
+
+
+def test_outlines_decide_about_the_relief():
+    cameras = bodies.cameras_around(24, size=120, distance=3.0)
+    angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 200)
+    points = 0.88 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    points[[0, -1], 0] = 0.0
+    outer = Revolution(_UPRIGHT, Profile(points, closed=False), 1.8)
+    mesh = _stretched(revolved.revolve(points / 0.88 * 0.9, azimuths=128))
+    relief = measure_relief(mesh, _UPRIGHT, 1.8)
+    six_sided, ball = (
+        Outlines(Views(bodies.masks_of(solid, cameras, steps=120), cameras))
+        for solid in (_ball_with_six_sides, lambda p: bodies.ball(p, radius=0.9))
+    )
+    found = [fit_profile(outer, six_sided, relief=each) for each in (None, relief)]
+    assert found[0].relief is None and found[1].relief is relief
+    wrong = []
+    for body in found:
+        vertices = body.pose(body.start()).vertices
+        foot = vertices[(vertices[:, 2] > -0.8) & (vertices[:, 2] < -0.4)]
+        wrong.append(np.sqrt(np.mean(_ball_with_six_sides(foot) ** 2)) / 0.6)
+    assert wrong[1] < 0.25 * wrong[0]
+    assert fit_profile(outer, ball, relief=relief).relief is None
+
+
+def _ball_with_six_sides(points):
+    """Less than the distance from a ball of radius 0.9 whose foot has six sides."""
+    return 0.6 * (np.linalg.norm(points / _six_sided(points), axis=-1) - 0.9)
