@@ -7,6 +7,7 @@ keeps the smallest that held-out pixels do not find significantly worse than the
 Source: ours; the paper (arXiv 2505.05848) smooths by hand, and trains the index with the field.
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -52,11 +53,6 @@ _LOOK, _LOOK_BLUR, _INDEX_BLURS = 8192, 2, (2, 1, 0, 0)
 # Half-width of the parabola for the standard error of an index.
 _APART = 0.01
 
-# Lengths over which a free surface is smoothed before each group of steps: noise that the handles
-# cannot remove; world units of a body of diameter 2.6. Steps of each group, without blur, scale of
-# the robust weights in the first step, and gain of two steps below which a group ends.
-_SMOOTHINGS, _GROUPS, _WIDEST, _GAIN = (0.05, 0.02, 0.02), (2, 2, 10), 0.3, 0.01
-
 # Share of the vertices that have several normals, above which a mesh has creases.
 _CREASED = 0.02
 
@@ -72,6 +68,28 @@ _LONGEST, _LONG = 0.015, 4.0
 
 # Lengths are stated for bodies of this diameter, world units.
 _STATED_FOR = 2.6
+
+
+@dataclasses.dataclass(frozen=True)
+class FreeSurfaceSettings:
+    """Settings of the fit of a free surface, in groups of steps.
+
+    Attributes:
+      smoothings: lengths over which the surface is smoothed before each group: noise that the
+        handles cannot remove; world units of a body of diameter 2.6.
+      counts: number of steps of each group, without blur.
+      widest: scale of the robust weights in the first step of the last group, sRGB.
+      gain: gain of two steps below which a group ends.
+    """
+
+    smoothings: tuple[float, ...] = (0.05, 0.02, 0.02)
+    counts: tuple[int, ...] = (2, 2, 10)
+    widest: float = 0.3
+    gain: float = 0.01
+
+
+_USUAL_FREE_SURFACE = FreeSurfaceSettings()
+_FROM_FAMILY = FreeSurfaceSettings(smoothings=(0.0,), counts=(10,))
 
 
 class SingleObject:
@@ -288,7 +306,7 @@ def fit_shapes(
     blur = first_blur(fixed.pose(nothing.x), surface, judges)
     *few, free = families.candidates(mesh)
     count = blur + _FAMILY_STEPS
-    total, done = (count + 2) * len(few) + blur + sum(_GROUPS) + 4, 0
+    total, done = (count + 2) * len(few) + blur + sum(_USUAL_FREE_SURFACE.counts) + 4, 0
     for shape in few:
         begin, label = done, shape.name
         blurs = (*range(blur, 0, -1), *[0] * _FAMILY_STEPS)
@@ -303,12 +321,20 @@ def fit_shapes(
     if is_enough(trials):
         return tuple(trials)
     best = min(trials, key=lambda trial: trial.error)
+    from_masks = best is trials[0]
     trials.append(
-        _fit_free(
-            task,
-            best,
-            blur if best is trials[0] else 0,
-            functools.partial(_report, progress, free.name, done, total),
+        fit_free_surface(
+            best.mesh,
+            best.outer_index,
+            surface,
+            pixels,
+            judges,
+            settings=_USUAL_FREE_SURFACE if from_masks else _FROM_FAMILY,
+            blur=blur if from_masks else 0,
+            deviation=deviation,
+            outlines=outlines,
+            seed=seed,
+            progress=functools.partial(_report, progress, free.name, done, total),
         )
     )
     progress(1.0, "done")
@@ -364,24 +390,52 @@ class _Task(NamedTuple):
         return judged(name, model, fit, self.surface, self.judges)
 
 
-def _fit_free(
-    task: _Task, start: Trial, blur: int, progress: Callable[[int, StepFacts], None]
+def fit_free_surface(
+    mesh: Mesh,
+    index: float,
+    surface: Backdrop,
+    pixels: Photographs,
+    judges: Photographs,
+    *,
+    settings: FreeSurfaceSettings = _USUAL_FREE_SURFACE,
+    blur: int = 0,
+    deviation: float = _INDEX_DEVIATION,
+    outlines: Outlines | None = None,
+    seed: int = 0,
+    progress: Callable[[int, StepFacts], None] = lambda step, facts: None,
 ) -> Trial:
-    """Fits a free surface, from the mesh of masks or from a family."""
-    mesh, index, done = _with_many_vertices(start.mesh), start.outer_index, 0
-    smoothings = _SMOOTHINGS if start.name == "masks" else (0.0,)
-    groups = zip(smoothings, _GROUPS[-len(smoothings) :], strict=True)
+    """Fits a free surface to photographs.
+
+    Args:
+      mesh: mesh to begin with.
+      index: its index of refraction, as far as it is known.
+      surface: backdrop.
+      pixels: pixels to fit.
+      judges: other pixels.
+      settings: settings of the groups of steps.
+      blur: blur of the backdrop in the very first step, in halvings (`first_blur`); one less in
+        each that follows.
+      deviation: standard deviation of the index; 0 keeps it.
+      outlines: equations of the masks' outlines.
+      seed: seed of the draws.
+      progress: called with the number of steps, and what the last one did.
+    """
+    task = _Task(surface, pixels, judges, outlines, deviation, seed)
+    mesh, done = _with_many_vertices(mesh), 0
+    groups = zip(settings.smoothings, settings.counts, strict=True)
     for number, (smoothing, count) in enumerate(groups):
-        widest = _WIDEST if number == len(smoothings) - 1 else 0.0
         if smoothing and not _has_creases(mesh):
             mesh = diffuse(mesh, smoothing * diameter(mesh.vertices) / _STATED_FOR)
-        model = SingleObject(FreeSurface(mesh), index, deviation=task.deviation)
-        coarse = tuple(range(blur, 0, -1)) if number == 0 else ()
-        settings = Steps(
-            (*coarse, *[0] * count), seed=task.seed + number, widest=widest, gain=_GAIN
+        model = SingleObject(FreeSurface(mesh), index, deviation=deviation)
+        is_last = number == len(settings.counts) - 1
+        steps = Steps(
+            (*(range(blur, 0, -1) if number == 0 else ()), *[0] * count),
+            seed=seed + number,
+            widest=settings.widest if is_last else 0.0,
+            gain=settings.gain,
         )
-        fit = task.fit(model, settings, functools.partial(_later, progress, done))
-        done += len(settings.blurs)
+        fit = task.fit(model, steps, functools.partial(_later, progress, done))
+        done += len(steps.blurs)
         mesh, index = model.mesh(fit.x), model.index_of(fit.x)
     return task.judged(model.shape.name, model, fit)
 
