@@ -164,13 +164,20 @@ def run(
         shape=chosen.name,
         before=masks.error,
         after=chosen.error,
-        deviation=chosen.index_deviation if kept and estimated else None,
+        deviation=_index_deviation(chosen, trials) if kept and estimated else None,
         undetermined=unknown,
         split=seen.split,
         remark=remark,
         trials=tuple(_facts(trial, min(trials, key=lambda each: each.error)) for trial in trials),
         parts=parts,
     )
+
+
+def _index_deviation(chosen: Trial, trials: Sequence[Trial]) -> float:
+    """Returns the standard deviation of the index; hypotheses of vessels are rivals."""
+    vessels = [each for each in trials if isinstance(each.model, Vessel)]
+    rivals = vessels if isinstance(chosen.model, Vessel) else []
+    return model_selection.index_deviation(chosen, rivals)
 
 
 def choose(scene: Path, mesh: Mesh, trials: Sequence[Trial]) -> tuple[Trial, Trial, str]:

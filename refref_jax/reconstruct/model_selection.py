@@ -29,6 +29,9 @@ _WORSE = 2.0
 # as much.
 _LEVEL = 0.25 / 255.0
 
+# Largest error of a hypothesis that might be true as well, relative to that of the chosen one.
+_CLOSE = 1.25
+
 
 @runtime_checkable
 class ObjectModel(Model, Protocol):
@@ -134,6 +137,22 @@ def choose(trials: Sequence[Trial]) -> Trial:
         if worse.mean <= max(_WORSE * worse.error, _LEVEL):
             return trial
     return best
+
+
+def index_deviation(chosen: Trial, rivals: Sequence[Trial]) -> float:
+    """Returns the standard deviation of the index of a trial, with what pixels do not tell.
+
+    Vessels have errors of the model that all views share: the covariance knows nothing of them, but
+    other hypotheses that explain the judges nearly as well have other indices. The largest
+    difference from those whose error is at most a quarter larger is added, in squares.
+
+    Args:
+      chosen: the trial that was kept.
+      rivals: other hypotheses of the same kind; the trial itself may be among them.
+    """
+    close = [each for each in rivals if each.error <= _CLOSE * chosen.error]
+    most = max((abs(each.outer_index - chosen.outer_index) for each in close), default=0.0)
+    return math.hypot(chosen.index_deviation, most)
 
 
 def normal_deviations(trial: Trial) -> Float[np.ndarray, " normals"]:

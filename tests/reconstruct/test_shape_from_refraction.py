@@ -21,7 +21,13 @@ from refref_jax.reconstruct import (
 )
 from refref_jax.reconstruct.families import Sphere
 from refref_jax.reconstruct.gauss_newton import Candidate, Fit, Steps
-from refref_jax.reconstruct.model_selection import Trial, choose, compare, normal_deviations
+from refref_jax.reconstruct.model_selection import (
+    Trial,
+    choose,
+    compare,
+    index_deviation,
+    normal_deviations,
+)
 from refref_jax.reconstruct.photometry import Photographs, make_backdrop
 from refref_jax.reconstruct.refractive_index import IndexSearch
 from refref_jax.reconstruct.shape_from_refraction import SingleObject
@@ -577,3 +583,17 @@ def test_one_view_has_no_standard_error():
     masks, free = _trial("masks", 1, [0.03]), _trial("free", 500, [0.02])
     assert compare(masks, free) == pytest.approx((0.01, 0.0))
     assert choose([masks, free]) is free and choose([masks, masks._replace(name="same")]) is masks
+
+
+def test_the_index_is_as_uncertain_as_hypotheses_that_explain_nearly_as_much():
+    def known(index, error):
+        model = SingleObject(Sphere(np.zeros(3), 1.0), index)
+        fit = Fit(model.start(), np.diag([0.0] * 4 + [3e-4**2]), ())
+        return Trial("a ball", model, fit, np.array([error]))
+
+    chosen = known(1.48, 0.04)
+    assert chosen.index_deviation == pytest.approx(3e-4)
+    assert index_deviation(chosen, []) == pytest.approx(3e-4)
+    assert index_deviation(chosen, [chosen, known(1.46, 0.06)]) == pytest.approx(3e-4)
+    found = index_deviation(chosen, [chosen, known(1.484, 0.045), known(1.479, 0.041)])
+    assert found == pytest.approx(np.hypot(3e-4, 4e-3))
