@@ -19,10 +19,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, UInt32
 
 from refref_jax import numerics
+from refref_jax.compilation import native_loop
 from refref_jax.geometry import bvh_nodes
 from refref_jax.geometry.bvh import BVH, Hits, closest_hits
 from refref_jax.geometry.rays import Rays
-from refref_jax.native_loop import native_loop
 
 _ORIGIN_BITS = 2
 _EXIT_BITS = 4

@@ -15,7 +15,7 @@ _FLOORS = {
     "choices": 0,
     "numerics": 0,
     "atomic_files": 0,
-    "native_loop": 0,
+    "compilation": 0,
     "configuration": 1,
     "geometry": 1,
     "optics": 2,
@@ -53,7 +53,7 @@ _MAY_JIT = {
     "training/loop.py",
     "training/evaluation.py",
     "reconstruct/occupancy.py",
-    "native_loop.py",
+    "compilation.py",
     "reconstruct/photometry.py",
     "reconstruct/refractive_index.py",
 }

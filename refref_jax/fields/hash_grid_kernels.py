@@ -30,7 +30,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, UInt32
 
 from refref_jax.choices import Precision
-from refref_jax.native_loop import native_loop
+from refref_jax.compilation import native_loop
 
 # Primes of Instant NGP's spatial hash.
 _PRIMES = (1, 2654435761, 805459861)

@@ -21,8 +21,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from refref_jax.compilation import native_loop
 from refref_jax.geometry import bvh_nodes, triangles
-from refref_jax.native_loop import native_loop
 
 PACKET = 16
 """Number of rays in a packet: two vectors of eight, which hide each other's latency."""

@@ -35,7 +35,7 @@ from jaxtyping import Array, Float, Int
 
 from refref_jax import numerics
 from refref_jax.choices import Space
-from refref_jax.native_loop import native_loop, record, with_record
+from refref_jax.compilation import native_loop, record, with_record
 from refref_jax.optics.light_paths import PathEnds
 from refref_jax.sampling import scene_bounds
 from refref_jax.sampling.scene_bounds import Domain
