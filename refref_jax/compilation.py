@@ -1,17 +1,35 @@
-"""Makes XLA compile a loop nest for the CPU as one native function.
+"""Settings of XLA: loops compiled as one native function, and a flag for versions slow on GPUs.
 
 XLA:CPU runs a `while_loop` as many small kernels, dispatched one by one. A call with the attribute
 set by `native_loop` is instead emitted as one function with real control flow, which makes BVH
 traversal about five times faster. The attribute is internal to XLA: versions that do not know it
 ignore it, and only the speed changes.
+
+Some versions compile scatter-adds of single floats for NVIDIA GPUs as loops that compare and swap,
+hundreds of times slower than an addition in memory. `add_missing_flag` sets the flag that they
+need, before JAX starts.
 """
 
+import importlib.metadata
+import os
+import warnings
 from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar
 
 import jax
+from jax._src import xla_bridge
 from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array
+
+_SLOW_ATOMICS = ("0.10.2", "0.11.0")
+"""Versions of jaxlib whose scatter-adds compare and swap (jax-ml/jax#38806)."""
+
+_ATOMICS_FLAG = "--xla_backend_extra_options=-nvptx-allow-ftz-atomics"
+
+# Parts of flags with which these versions add in memory, as their PTX shows.
+_ENOUGH = ("nvptx-allow-ftz-atomics", "--xla_gpu_ftz=true")
+
+_PLUGINS = ("jax-cuda12-plugin", "jax-cuda13-plugin")
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
@@ -56,3 +74,39 @@ def with_record(values: Array, at: Array, value: Array) -> Array:
     """Returns an array with one record replaced."""
     update = jax.lax.dynamic_update_index_in_dim
     return update(values, value, at, axis=0, allow_negative_indices=False)
+
+
+def add_missing_flag() -> None:
+    """Sets the flag of XLA that a slow version needs on NVIDIA GPUs; other versions refuse it.
+
+    Does nothing without a CUDA plugin. JAX reads flags when it starts, that is, with the first
+    array: later, or if the flag's name has another value already, a warning says what to do.
+
+    Source: openxla/xla#46225. The flag, and `--xla_gpu_ftz=true`, were seen to turn
+    `atom.cas.b32` into `atom.add.f32` in the PTX of jaxlib 0.10.2 for an H100.
+    """
+    flags, name = os.environ.get("XLA_FLAGS", ""), _ATOMICS_FLAG.split("=")[0]
+    version = _version("jaxlib")
+    plugin = any(_version(each) for each in _PLUGINS)
+    if version not in _SLOW_ATOMICS or not plugin or any(each in flags for each in _ENOUGH):
+        return
+    if has_started() or name in flags:
+        warnings.warn(
+            f"jaxlib {version} is slow on NVIDIA GPUs: its scatter-adds compare and swap. Set "
+            f"XLA_FLAGS={_ATOMICS_FLAG} before JAX starts, or install jax==0.10.1.",
+            stacklevel=3,
+        )
+        return
+    os.environ["XLA_FLAGS"] = f"{flags} {_ATOMICS_FLAG}".strip()
+
+
+def has_started() -> bool:
+    """Returns whether JAX has read its flags, because an array or a device was used."""
+    return xla_bridge.backends_are_initialized()
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None

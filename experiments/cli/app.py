@@ -6,6 +6,8 @@ flags are reported immediately.
 """
 
 import difflib
+import importlib
+import importlib.util
 import os
 import shlex
 import signal
@@ -42,6 +44,8 @@ def run(main: Callable[..., None], *, arguments: Sequence[str] = (), again: str 
             threading.Thread(target=_stop_with_input, daemon=True).start()
         logging.set_verbosity(logging.ERROR)
         refuse_words(module, words[1:], arguments)
+        if importlib.util.find_spec("jax_plugins"):  # JAX may run on a GPU
+            importlib.import_module("refref_jax.compilation").add_missing_flag()
         try:
             main(*words[1:])
         except (ValueError, OSError) as error:

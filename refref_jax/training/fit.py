@@ -19,7 +19,7 @@ from typing import Any, Literal, NamedTuple
 import jax
 from jax.sharding import Mesh
 
-from refref_jax import atomic_files, configuration
+from refref_jax import atomic_files, compilation, configuration
 from refref_jax.data import image_files, scene_analysis, scene_folder, scene_source
 from refref_jax.data.batches import PixelSampler
 from refref_jax.data.meshes import MeshPart
@@ -97,6 +97,7 @@ def fit(
       ValueError: if the configuration, the scene or the folder is not suitable for training.
       KeyboardInterrupt: if `stop` returned `True` before the first step.
     """
+    compilation.add_missing_flag()
     with contextlib.ExitStack() as stack:
         if out is None:
             out = stack.enter_context(tempfile.TemporaryDirectory(prefix="refref_jax_"))

@@ -1,0 +1,86 @@
+"""The flag for versions of XLA that are slow on GPUs; loops are tested where they are used."""
+
+import importlib.metadata
+import os
+import subprocess
+import sys
+import warnings
+
+import pytest
+
+from refref_jax import compilation
+
+_FLAG = "--xla_backend_extra_options=-nvptx-allow-ftz-atomics"
+
+
+@pytest.fixture
+def installed(monkeypatch):
+    """Sets the versions that are installed, and makes it seem that JAX has not started."""
+    versions = {"jaxlib": "0.10.2", "jax-cuda13-plugin": "0.10.2"}
+
+    def version(package):
+        if package not in versions:
+            raise importlib.metadata.PackageNotFoundError(package)
+        return versions[package]
+
+    monkeypatch.setattr(importlib.metadata, "version", version)
+    monkeypatch.setattr(compilation, "has_started", lambda: False)
+    monkeypatch.setenv("XLA_FLAGS", "--xla_dump_to=here")
+    return versions
+
+
+def test_a_slow_version_with_a_cuda_plugin_gets_the_flag(installed):
+    compilation.add_missing_flag()
+    assert os.environ["XLA_FLAGS"] == f"--xla_dump_to=here {_FLAG}"
+    compilation.add_missing_flag()
+    assert os.environ["XLA_FLAGS"].count("nvptx") == 1
+
+
+@pytest.mark.parametrize("version", ["0.10.0", "0.10.1", "0.11.2"])
+def test_other_versions_which_refuse_the_flag_do_not_get_it(installed, version):
+    installed["jaxlib"] = version
+    compilation.add_missing_flag()
+    assert os.environ["XLA_FLAGS"] == "--xla_dump_to=here"
+
+
+def test_nothing_is_set_without_a_cuda_plugin(installed):
+    del installed["jax-cuda13-plugin"]
+    compilation.add_missing_flag()
+    assert os.environ["XLA_FLAGS"] == "--xla_dump_to=here"
+
+
+@pytest.mark.parametrize(
+    "flags", ["--xla_gpu_ftz=true", "--xla_backend_extra_options=-nvptx-allow-ftz-atomics=true"]
+)
+def test_flags_with_the_same_effect_are_left_alone(installed, monkeypatch, flags):
+    monkeypatch.setenv("XLA_FLAGS", flags)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        compilation.add_missing_flag()
+    assert os.environ["XLA_FLAGS"] == flags
+
+
+def test_a_warning_says_what_to_do_where_it_is_too_late(installed, monkeypatch):
+    monkeypatch.setattr(compilation, "has_started", lambda: True)
+    with pytest.warns(UserWarning, match=r"jaxlib 0\.10\.2 is slow on NVIDIA.*before JAX starts"):
+        compilation.add_missing_flag()
+    assert os.environ["XLA_FLAGS"] == "--xla_dump_to=here"
+
+
+def test_other_options_of_the_same_flag_are_not_overwritten(installed, monkeypatch):
+    flags = "--xla_backend_extra_options=-x"
+    monkeypatch.setenv("XLA_FLAGS", flags)
+    with pytest.warns(UserWarning, match="Set XLA_FLAGS=.*nvptx"):
+        compilation.add_missing_flag()
+    assert os.environ["XLA_FLAGS"] == flags
+
+
+def test_it_is_known_whether_jax_has_started():
+    words = (
+        "from refref_jax import compilation; import jax.numpy as jnp; "
+        "print(compilation.has_started()); jnp.zeros(1); print(compilation.has_started())"
+    )
+    answer = subprocess.run(
+        [sys.executable, "-c", words], capture_output=True, text=True, check=True
+    )
+    assert answer.stdout.split() == ["False", "True"]
