@@ -35,9 +35,6 @@ from refref_jax.reconstruct.shapes import FixedShape
 _SCENE = flags.DEFINE_string("scene", None, "Folder of the scene.", required=True)
 _RECONSTRUCTION = flags.DEFINE_string("reconstruction", None, "Its reconstruction.", required=True)
 
-_WIDER = 0.5
-"""Standard deviation of how much too wide all masks are, pixels."""
-
 _EVEN = 1e3
 """Scale of the robust weights at which all pixels have the same, sRGB."""
 
@@ -100,7 +97,7 @@ def _fitted(
     variant: Variant,
 ) -> Trial:
     """Fits a free surface."""
-    outlines = Outlines(light_stage.read_views(scene), common=_WIDER, seed=0)
+    outlines = Outlines(light_stage.read_views(scene), common=light_stage.WIDER, seed=0)
     fixed = SingleObject(FixedShape(mesh), index)
     blur = first_blur(fixed.pose(fixed.start()), surface, seen.judges) if variant.blur else 0
     return fit_free_surface(

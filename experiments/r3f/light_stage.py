@@ -31,7 +31,7 @@ from refref_jax import atomic_files
 from refref_jax.choices import CLEAR, Split
 from refref_jax.data import meshes, scene_folder
 from refref_jax.geometry.rays import Rays
-from refref_jax.geometry.triangle_meshes import Mesh, diameter, face_vectors, volume
+from refref_jax.geometry.triangle_meshes import Mesh, face_vectors, volume
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.optics.media import INDEX_OF_AIR
 from refref_jax.reconstruct import (
@@ -81,8 +81,8 @@ _MATERIALS = [
 # outlines by a pixel.
 _VOLUME_CHANGE = 0.02
 
-# Standard deviation of how much too wide all masks are, pixels.
-_WIDER = 0.5
+WIDER = 0.5
+"""Standard deviation of how much too wide all masks are, pixels."""
 
 # Deviation of normals beyond which light has not determined them, degrees.
 _UNKNOWN = 0.5
@@ -270,7 +270,7 @@ def look_at_ends(
     outer = families.fit_revolution(mesh, furthest=_FURTHEST)
     if outer is None:
         return RevolvedObject(None)
-    relief = measure_relief(mesh, outer.axis, diameter(mesh.vertices))
+    relief = measure_relief(mesh, outer.axis)
     outer = fit_profile(outer, Outlines(read_views(scene), seed=seed), relief=relief)
     ends = opaque_ends.find_opaque_ends(outer, surface, seen.fitted, seed=seed)
     return RevolvedObject(outer, ends)
@@ -310,7 +310,7 @@ def fit(
             surface,
             seen.fitted,
             seen.judges,
-            outlines=Outlines(views, common=_WIDER, seed=seed),
+            outlines=Outlines(views, common=WIDER, seed=seed),
             seed=seed,
             is_enough=lambda trials: _may_be_vessel(outer, trials),
             progress=lambda share, text: bar.show(round(100 * share), text),
@@ -324,7 +324,7 @@ def fit(
     masks, chosen, _ = choose(scene, mesh, trials)
     if chosen is masks or isinstance(chosen.model, Vessel):
         return trials
-    outlines = Outlines(views, common=_WIDER, seed=seed)
+    outlines = Outlines(views, common=WIDER, seed=seed)
     return (*trials, *_with_bubbles(chosen, surface, seen, outlines, seed=seed))
 
 

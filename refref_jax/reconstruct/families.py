@@ -32,6 +32,7 @@ from refref_jax.reconstruct.revolution import (
     find_axis,
     fit_axis_and_profile,
     lathe,
+    lengths,
     profile_normals,
 )
 from refref_jax.reconstruct.shapes import (
@@ -276,18 +277,9 @@ def _turn_right(along: np.ndarray) -> np.ndarray:
     return np.stack([along[:, 1], -along[:, 0]], axis=1)
 
 
-def _even_length(profile: Profile) -> tuple[Float[np.ndarray, " n"], Curve]:
-    """Returns lengths along a profile and its points; a closed one returns to its first."""
-    points = profile.points
-    if profile.closed:
-        points = np.concatenate([points, points[:1]])
-    steps = np.linalg.norm(np.diff(points, axis=0, prepend=points[:1]), axis=-1)
-    return np.cumsum(steps), points
-
-
 def _places(profile: Profile, count: int) -> tuple[Float[np.ndarray, " count"], float]:
     """Returns lengths along a profile, half of them even and half where it turns; its length."""
-    length, _ = _even_length(profile)
+    length = lengths(profile.curve)
     normals = profile_normals(profile)
     if profile.closed:
         normals = np.concatenate([normals, normals[:1]])
@@ -310,7 +302,8 @@ def _between_knots(profile: Profile, knots: Float[np.ndarray, " knots"]) -> Call
 
     Shorter waves are noise, which no offset at the knots could remove.
     """
-    length, points = _even_length(profile)
+    points = profile.curve
+    length = lengths(points)
     one = np.eye(len(knots))
     if profile.closed:
         cubics = [_even_spline(knots, float(length[-1]), True)] * 2

@@ -1,12 +1,12 @@
 """Vessels of glass with liquid and air inside: bodies of revolution, as unknowns of a fit.
 
 A vessel has an outer and an inner wall, both profiles around an upright axis that move along their
-normals (`walls`). What is inside is cut by horizontal surfaces: liquid up to a level, glass of a
-small height (the *gap*), and air above. The mouth may be open; then the glass ends at a rim, and
-the air inside is that outside. `Vessel` is a `gauss_newton.Model`; `interior_search` finds out what
-is inside.
+normals (`walls`), and may have a relief. What is inside is cut by horizontal surfaces: liquid up to
+a level, glass of a small height (the *gap*), and air above. The mouth may be open; then the glass
+ends at a rim, and the air inside is that outside. `Vessel` is a `gauss_newton.Model`;
+`interior_search` finds out what is inside.
 
-What this cannot represent: handles and spouts; a tilted level, or its rise at the wall; drops and
+What this cannot represent: handles; a tilted level, or its rise at the wall; drops and
 bubbles; liquid in a ring around a raised bottom that is higher than the level; tilted vessels;
 walls that reach into each other; a stopper of another material.
 

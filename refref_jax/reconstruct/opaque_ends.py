@@ -27,7 +27,7 @@ from refref_jax.optics.media import INDEX_OF_AIR
 from refref_jax.reconstruct import gauss_newton, photometry, walls
 from refref_jax.reconstruct.families import Revolution, place
 from refref_jax.reconstruct.photometry import Backdrop, Photographs
-from refref_jax.reconstruct.revolution import Profile, lathe, profile_normals
+from refref_jax.reconstruct.revolution import Profile, even, lathe, profile_normals
 from refref_jax.reconstruct.shape_from_refraction import SingleObject
 from refref_jax.reconstruct.shapes import FixedShape, mesh_of
 from refref_jax.reconstruct.turned import Turned
@@ -211,7 +211,7 @@ def clear_part(outer: Revolution, ends: Sequence[OpaqueEnd]) -> Revolution:
         first = int(np.flatnonzero(kept[:, 1] <= low)[-1]) + 1
         rim = _at_height(kept[first - 1], kept[first], low)
         kept = np.concatenate([[[0.0, low]], rim, kept[first:]])
-    profile = Profile(walls.even(kept, _PROFILE_POINTS), closed=False)
+    profile = Profile(even(kept, _PROFILE_POINTS), closed=False)
     size = float(max(2.0 * kept[:, 0].max(), np.ptp(kept[:, 1])))
     return Revolution(outer.axis, profile, size, outer.relief)
 
@@ -242,7 +242,7 @@ def mesh_of_end(outer: Revolution, end: OpaqueEnd) -> Mesh:
     points = outer.points[lowest : highest + 1]
     inside = points[(points[:, 1] > end.low) & (points[:, 1] < end.high)]
     rims = np.stack([[inside[0, 0], end.low], [inside[-1, 0], end.high]])
-    side = walls.even(np.concatenate([rims[:1], inside, rims[1:]]), _POINTS)
+    side = even(np.concatenate([rims[:1], inside, rims[1:]]), _POINTS)
     normals = profile_normals(Profile(side, closed=False))
     still = np.zeros((len(side), 2, 0))
     stretch = Stretch(Turned(side, still, normals, still))

@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import gaussian_filter1d
 
-from refref_jax.geometry.triangle_meshes import Mesh
+from refref_jax.geometry.triangle_meshes import Mesh, diameter
 from refref_jax.reconstruct.revolution import Axis, slice_faces
 
 # Sections, azimuths, and the standard deviation of the smoothing along the axis, in sections.
@@ -83,7 +83,7 @@ class Relief:
         return Stretched(factor[:, None] * flat + points * [0.0, 0.0, 1.0], jacobian)
 
 
-def measure_relief(mesh: Mesh, axis: Axis, size: float) -> Relief | None:
+def measure_relief(mesh: Mesh, axis: Axis) -> Relief | None:
     """Measures how far the outermost radii of a mesh are from those of a body of revolution.
 
     Sections whose radii vary by no more than the noise of masks count as round.
@@ -91,7 +91,6 @@ def measure_relief(mesh: Mesh, axis: Axis, size: float) -> Relief | None:
     Args:
       mesh: closed mesh.
       axis: axis of the body of revolution.
-      size: diameter of the mesh, world units.
 
     Returns:
       The relief; `None` if all sections are round.
@@ -106,7 +105,8 @@ def measure_relief(mesh: Mesh, axis: Axis, size: float) -> Relief | None:
     # Along the normal: where a surface is nearly level, small errors move its radius by much.
     rise = np.gradient(mean[:, 0], step)[:, None]
     spread = radii.std(axis=1, keepdims=True) / np.hypot(1.0, rise)
-    kept = np.maximum(1.0 - (_NOISE * size / np.maximum(spread, 1e-300)) ** 2, 0.0)
+    noise = _NOISE * diameter(mesh.vertices)
+    kept = np.maximum(1.0 - (noise / np.maximum(spread, 1e-300)) ** 2, 0.0)
     factors = gaussian_filter1d(kept * (radii / mean - 1.0), _SMOOTHING, axis=0, mode="nearest")
     return Relief(low, step, factors) if factors.any() else None
 
@@ -135,12 +135,16 @@ def _outermost(
 def _azimuths_between(
     start: Float[np.ndarray, "cuts 2"], end: Float[np.ndarray, "cuts 2"]
 ) -> tuple[Int[np.ndarray, " cuts"], Int[np.ndarray, " cuts"]]:
-    """Returns the first azimuth that each cut meets on its way around the axis, and how many."""
+    """Returns the first azimuth that each cut meets on its way around the axis, and how many.
+
+    Cuts end before an azimuth at their end, which the next one meets: those towards the axis meet
+    none.
+    """
     turn = np.arctan2(
         start[:, 0] * end[:, 1] - start[:, 1] * end[:, 0], np.sum(start * end, axis=-1)
     )
     unit = _AZIMUTHS / (2.0 * np.pi)
     begin = unit * np.arctan2(start[:, 1], start[:, 0])
     first = np.ceil(begin).astype(np.int64)
-    last = np.floor(begin + unit * turn).astype(np.int64)
-    return first, np.maximum(last - first + 1, 0)
+    end_before = np.ceil(begin + unit * turn).astype(np.int64)
+    return first, np.maximum(end_before - first, 0)

@@ -174,6 +174,11 @@ class Profile(NamedTuple):
     points: Float[np.ndarray, "points 2"]
     closed: bool
 
+    @property
+    def curve(self) -> Curve:
+        """The points; a closed profile returns to its first."""
+        return np.concatenate([self.points, self.points[:1]]) if self.closed else self.points
+
 
 class Fit(NamedTuple):
     """A surface of revolution fitted to a mesh.
@@ -356,26 +361,37 @@ def _loop(points: Curve, closed: bool) -> Float[np.ndarray, "loop 2"]:
     return points if closed else np.concatenate([points, points[-2:0:-1] * [-1.0, 1.0]])
 
 
+def lengths(points: Curve) -> Float[np.ndarray, " points"]:
+    """Returns the lengths along a curve, which grow even where points coincide."""
+    steps = np.linalg.norm(np.diff(points, axis=0, prepend=points[:1]), axis=-1)
+    least = np.append(0.0, np.full(len(points) - 1, 1e-9 * steps.sum()))
+    return np.cumsum(np.maximum(steps, least))
+
+
+def even(points: Curve, count: int) -> Float[np.ndarray, "count 2"]:
+    """Returns a curve in even steps."""
+    length = lengths(points)
+    ticks = np.linspace(0.0, length[-1], count)
+    return np.stack([np.interp(ticks, length, points[:, i]) for i in (0, 1)], axis=-1)
+
+
 def even_profile(profile: Profile, size: float) -> Profile:
     """Returns a profile in even steps, which depend on the diameter of the body."""
-    points = profile.points
-    if profile.closed:
-        points = np.concatenate([points, points[:1]])
-    length = np.cumsum(np.linalg.norm(np.diff(points, axis=0, prepend=points[:1]), axis=-1))
-    ticks = np.linspace(0.0, length[-1], max(int(length[-1] / (_STEP * size)), 16) + 1)
-    even = np.stack([np.interp(ticks, length, points[:, i]) for i in (0, 1)], axis=-1)
-    return Profile(even[:-1] if profile.closed else even, profile.closed)
+    points = profile.curve
+    steps = max(int(lengths(points)[-1] / (_STEP * size)), 16)
+    found = even(points, steps + 1)
+    return Profile(found[:-1] if profile.closed else found, profile.closed)
 
 
 def _smooth(profile: Profile, deviation: float, size: float) -> Profile:
     """Returns a profile smoothed along its length by a Gaussian; the poles stay on the axis."""
-    even = even_profile(profile, size)
-    loop = _loop(even.points, even.closed)
+    steps = even_profile(profile, size)
+    loop = _loop(steps.points, steps.closed)
     smooth = gaussian_filter1d(loop, deviation / (_STEP * size), axis=0, mode="wrap")
-    points = smooth[: len(even.points)]
-    if not even.closed:
+    points = smooth[: len(steps.points)]
+    if not steps.closed:
         points[[0, -1], 0] = 0.0
-    return Profile(points, even.closed)
+    return Profile(points, steps.closed)
 
 
 def profile_normals(profile: Profile) -> Curve:

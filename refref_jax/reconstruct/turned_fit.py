@@ -19,7 +19,14 @@ from scipy.optimize import least_squares
 from scipy.spatial import KDTree
 
 from refref_jax.geometry.triangle_meshes import Mesh, diameter
-from refref_jax.reconstruct.revolution import Axis, Curve, Fit, Profile, fit_axis_and_profile
+from refref_jax.reconstruct.revolution import (
+    Axis,
+    Curve,
+    Fit,
+    Profile,
+    even,
+    fit_axis_and_profile,
+)
 from refref_jax.reconstruct.shapes import (
     FURTHEST,
     Cloud,
@@ -269,12 +276,7 @@ class Line(NamedTuple):
 
 def even_samples(profile: Profile) -> Curve:
     """Returns the samples of a profile, in even steps; a closed one ends where it begins."""
-    points = profile.points
-    if profile.closed:
-        points = np.concatenate([points, points[:1]])
-    length = np.cumsum(np.linalg.norm(np.diff(points, axis=0, prepend=points[:1]), axis=-1))
-    ticks = np.linspace(0.0, length[-1], _CURVE_SAMPLES + 1)
-    return np.stack([np.interp(ticks, length, points[:, i]) for i in (0, 1)], axis=-1)
+    return even(profile.curve, _CURVE_SAMPLES + 1)
 
 
 def straight_pieces(samples: Curve, deviation: float, size: float) -> list[Line]:

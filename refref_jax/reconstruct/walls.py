@@ -19,7 +19,15 @@ from scipy.spatial import KDTree
 
 from refref_jax.reconstruct import ReconstructionError
 from refref_jax.reconstruct.families import Turned
-from refref_jax.reconstruct.revolution import Curve, Profile, Section, outline, profile_normals
+from refref_jax.reconstruct.revolution import (
+    Curve,
+    Profile,
+    Section,
+    even,
+    lengths,
+    outline,
+    profile_normals,
+)
 
 # Points of a profile while it is prepared, and cells along the diameter while it is inset.
 _STEPS, _CELLS = 600, 300
@@ -82,7 +90,7 @@ class Wall:
     def __init__(self, profile: Profile, *, points: int = 160, knots: int = 36) -> None:
         """Takes a profile that is not closed, and the sizes of the splines."""
         dense = even(profile.points, _STEPS)
-        length = _lengths(dense)
+        length = lengths(dense)
         self.length = float(length[-1])
         self.at = places(dense, points)
         knot = places(dense, knots)
@@ -327,7 +335,7 @@ def _starts(counts: Sequence[int]) -> Int[np.ndarray, " stretches"]:
 
 def places(points: Curve, count: int) -> Float[np.ndarray, " count"]:
     """Returns lengths along a curve, half of them even and half where it turns."""
-    length = _lengths(points)
+    length = lengths(points)
     along = np.diff(points, axis=0)
     angle = np.unwrap(np.arctan2(along[:, 1], along[:, 0]))
     turn = np.abs(gaussian_filter1d(np.diff(angle, prepend=angle[:1]), _TURNS, mode="nearest"))
@@ -408,18 +416,6 @@ def with_punt(profile: Profile, height: float) -> Profile:
     share = np.minimum(points[: last + 1, 0] / reach, 1.0)
     points[: last + 1, 1] += height * (1.0 - share**2)
     return Profile(points, profile.closed)
-
-
-def even(points: Curve, count: int) -> Float[np.ndarray, "count 2"]:
-    """Returns a curve in even steps."""
-    length = _lengths(points)
-    ticks = np.linspace(0.0, length[-1], count)
-    return np.stack([np.interp(ticks, length, points[:, i]) for i in (0, 1)], axis=-1)
-
-
-def _lengths(points: Curve) -> Float[np.ndarray, " points"]:
-    steps = np.linalg.norm(np.diff(points, axis=0, prepend=points[:1]), axis=-1)
-    return np.cumsum(np.maximum(steps, np.append(0.0, np.full(len(points) - 1, 1e-9))))
 
 
 def _turn_right(along: np.ndarray) -> np.ndarray:

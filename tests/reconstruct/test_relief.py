@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+import trimesh
 
 from refref_jax.geometry.triangle_meshes import (
-    diameter,
     face_normals,
     face_vectors,
     make_mesh,
@@ -45,7 +45,7 @@ def foot():
 
 @pytest.fixture(scope="module")
 def relief(foot):
-    return measure_relief(foot, _UPRIGHT, diameter(foot.vertices))
+    return measure_relief(foot, _UPRIGHT)
 
 
 def test_the_relief_of_a_foot_with_six_sides_is_measured(foot, relief):
@@ -60,13 +60,33 @@ def test_the_relief_of_a_foot_with_six_sides_is_measured(foot, relief):
 
 def test_a_round_mesh_has_no_relief():
     mesh = revolved.noisy(revolved.revolve(revolved.even(revolved.vase(), 200)), 0.001)
-    assert measure_relief(mesh, _UPRIGHT, diameter(mesh.vertices)) is None
+    assert measure_relief(mesh, _UPRIGHT) is None
+
+
+def test_walls_towards_the_axis_have_no_radius_of_their_own():
+    # A cogwheel of eight teeth: their sides are at azimuths that are looked at.
+    corners = np.tile([0.7, 1.0, 1.0, 0.7], 4)
+    angle = np.repeat(2.0 * np.pi * np.arange(8) / 8.0, 2)
+    ring = corners[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    wheel = trimesh.creation.extrude_triangulation(*_fan(ring), height=1.0)
+    wheel.apply_translation([0.0, 0.0, -0.5])
+    found = measure_relief(make_mesh(wheel.vertices, wheel.faces), _UPRIGHT)
+    radii = 1.0 + found.factors[60]
+    assert np.isfinite(found.factors).all()
+    assert radii.max() / radii.min() == pytest.approx(1.0 / (0.7 * np.cos(np.pi / 8.0)), rel=0.02)
+
+
+def _fan(ring):
+    """Triangles from the middle to a star-shaped polygon."""
+    first = np.arange(len(ring))
+    faces = np.stack([np.full(len(ring), len(ring)), first, np.roll(first, -1)], axis=-1)
+    return np.concatenate([ring, [[0.0, 0.0]]]), faces
 
 
 def test_a_moved_and_scaled_mesh_has_the_same_relief(foot, relief):
     moved = revolved.placed(foot, offset=np.array([1e3, -2e3, 5e2]), scale=10.0)
     axis = Axis(np.array([1e3, -2e3, 5e2]), np.eye(3))
-    found = measure_relief(moved, axis, diameter(moved.vertices))
+    found = measure_relief(moved, axis)
     np.testing.assert_allclose(found.factors, relief.factors, atol=1e-9)
     assert found.step == pytest.approx(10.0 * relief.step)
 
@@ -136,7 +156,7 @@ def test_outlines_decide_about_the_relief():
     points[[0, -1], 0] = 0.0
     outer = Revolution(_UPRIGHT, Profile(points, closed=False), 1.8)
     mesh = _stretched(revolved.revolve(points / 0.88 * 0.9, azimuths=128))
-    relief = measure_relief(mesh, _UPRIGHT, 1.8)
+    relief = measure_relief(mesh, _UPRIGHT)
     six_sided, ball = (
         Outlines(Views(bodies.masks_of(solid, cameras, steps=120), cameras))
         for solid in (_ball_with_six_sides, lambda p: bodies.ball(p, radius=0.9))
