@@ -21,10 +21,10 @@ from jax._src import xla_bridge
 from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array
 
-_SLOW_ATOMICS = ("0.10.2", "0.11.0")
+SLOW_ATOMICS = ("0.10.2", "0.11.0")
 """Versions of jaxlib whose scatter-adds compare and swap (jax-ml/jax#38806)."""
 
-_ATOMICS_FLAG = "--xla_backend_extra_options=-nvptx-allow-ftz-atomics"
+ATOMICS_FLAG = "--xla_backend_extra_options=-nvptx-allow-ftz-atomics"
 
 # Parts of flags with which these versions add in memory, as their PTX shows.
 _ENOUGH = ("nvptx-allow-ftz-atomics", "--xla_gpu_ftz=true")
@@ -82,22 +82,22 @@ def add_missing_flag() -> None:
     Does nothing without a CUDA plugin. JAX reads flags when it starts, that is, with the first
     array: later, or if the flag's name has another value already, a warning says what to do.
 
-    Source: openxla/xla#46225. The flag, and `--xla_gpu_ftz=true`, were seen to turn
-    `atom.cas.b32` into `atom.add.f32` in the PTX of jaxlib 0.10.2 for an H100.
+    Source: openxla/xla#46225. With the flag, `atom.cas.b32` becomes `atom.add.f32` in the PTX of
+    jaxlib 0.10.2 for an H100 (`benchmarks.gpu_scatter_adds`).
     """
-    flags, name = os.environ.get("XLA_FLAGS", ""), _ATOMICS_FLAG.split("=")[0]
+    flags, name = os.environ.get("XLA_FLAGS", ""), ATOMICS_FLAG.split("=")[0]
     version = _version("jaxlib")
     plugin = any(_version(each) for each in _PLUGINS)
-    if version not in _SLOW_ATOMICS or not plugin or any(each in flags for each in _ENOUGH):
+    if version not in SLOW_ATOMICS or not plugin or any(each in flags for each in _ENOUGH):
         return
     if has_started() or name in flags:
         warnings.warn(
             f"jaxlib {version} is slow on NVIDIA GPUs: its scatter-adds compare and swap. Set "
-            f"XLA_FLAGS={_ATOMICS_FLAG} before JAX starts, or install jax==0.10.1.",
+            f"XLA_FLAGS={ATOMICS_FLAG} before JAX starts, or install jax==0.10.1.",
             stacklevel=3,
         )
         return
-    os.environ["XLA_FLAGS"] = f"{flags} {_ATOMICS_FLAG}".strip()
+    os.environ["XLA_FLAGS"] = f"{flags} {ATOMICS_FLAG}".strip()
 
 
 def has_started() -> bool:
