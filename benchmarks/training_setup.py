@@ -4,6 +4,7 @@ from pathlib import Path
 
 from refref_jax.data import scene_folder
 from refref_jax.data.batches import PixelSampler
+from refref_jax.fields import registry
 from refref_jax.training import loop
 from refref_jax.training.config import TrainConfig
 from refref_jax.training.fit import prepare
@@ -13,15 +14,24 @@ from refref_jax.training.loop import PretracedBatches, TrainState, init_state
 def set_up_training(scene: Path, *, preset: str, paths: str) -> tuple[loop.Setup, TrainState]:
     """Returns a run before its first step, with the scene analysis of training.
 
+    All paths have the preset's usual samples, so that only the paths differ.
+
     Args:
       scene: folder of the scene.
       preset: name of a preset.
       paths: name of path settings.
     """
-    asked = TrainConfig().override(scene=str(scene), preset=preset, paths=paths)
+    asked = TrainConfig().override(
+        scene=str(scene), preset=preset, paths=paths, samples_per_ray=usual_samples(preset)
+    )
     (config, model, *_), objects = prepare(asked)
     setup = loop.set_up(config, model.config, model.settings, objects, sampler_of(config))
     return setup, init_state(config.seed, model.config, config.schedule)
+
+
+def usual_samples(preset: str) -> tuple[int, ...]:
+    """Returns the samples of each level of a preset, where walls are not the only thing seen."""
+    return registry.KINDS[registry.USUAL].sizes[preset].samples
 
 
 def sampler_of(config: TrainConfig) -> PixelSampler:

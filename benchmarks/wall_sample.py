@@ -19,9 +19,9 @@ import jax
 import numpy as np
 from absl import app, flags
 
-from benchmarks.training_setup import sampler_of
+from benchmarks.training_setup import sampler_of, usual_samples
 from refref_jax.render.model import Model
-from refref_jax.training import evaluation, loop, presets
+from refref_jax.training import evaluation, loop
 from refref_jax.training.config import TrainConfig
 from refref_jax.training.fit import prepare
 
@@ -92,7 +92,7 @@ def _set_up(seed: int) -> loop.Setup:
 def train_all(seed: int) -> dict[tuple[tuple[int, ...], str], _Training]:
     """Trains all models in turn, and returns them by their samples and place."""
     setup = _set_up(seed)
-    counts = (presets.samples_of(setup.model), tuple(map(int, _FEWER.value)))
+    counts = (usual_samples(_PRESET.value), tuple(map(int, _FEWER.value)))
     trainings = {
         (samples, place): _Training(setup, samples, place)
         for samples, place in itertools.product(counts, _PLACES)

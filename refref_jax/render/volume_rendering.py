@@ -84,6 +84,8 @@ def composite(
     weights: Float[Array, " samples"],
     rgb: Float[Array, "samples 3"],
     edges: Float[Array, " samples+1"],
+    *,
+    surface_at_end: bool = False,
 ) -> Composite:
     """Sums the samples of a path.
 
@@ -91,13 +93,18 @@ def composite(
       weights: weights `w_i`.
       rgb: linear colours.
       edges: distances of the edges of the intervals.
+      surface_at_end: whether the last interval stands for a surface at its end, as in `sample`,
+        which is its distance then; by default every interval is at its middle.
     """
     accumulation = jnp.sum(weights)
-    middles = 0.5 * (edges[1:] + edges[:-1])
-    mean = numerics.safe_divide(jnp.sum(weights * middles), accumulation)
+    places = 0.5 * (edges[1:] + edges[:-1])
     half = jnp.full((1,), 0.5, weights.dtype)
     level = numerics.safe_divide(half, accumulation[None])
     median = stepfun.invert_cdf(level, edges, stepfun.integrate_weights(weights))[0]
+    if surface_at_end:
+        places = places.at[-1].set(edges[-1])
+        median = jnp.where(jnp.sum(weights[:-1]) < 0.5, edges[-1], median)
+    mean = numerics.safe_divide(jnp.sum(weights * places), accumulation)
     return Composite(
         rgb=jnp.sum(weights[:, None] * rgb, axis=0),
         accumulation=accumulation,
@@ -182,7 +189,7 @@ def path_radiance(
     warp = distance_warp(config, line)
     samples, seen, histograms = _sampled(params, config, line, warp, jitter, anneal)
     weights = _weigh(config, seen.density, samples.t)
-    composited = composite(weights, seen.rgb, samples.t)
+    composited = composite(weights, seen.rgb, samples.t, surface_at_end=_ends_on_surface(config))
     return PathRadiance(
         composite=_in_arc_length(line, composited),
         histograms=(*histograms, Histogram(samples.s, weights)),
@@ -353,7 +360,7 @@ def sample(
     s = stepfun.snap(_draw(config, histograms, strata, anneal), bends)
     t = scene_bounds.to_distance(warp, s)
     starts, ends = t[:-1], t[1:]
-    if config.last_sample == "end" and config.space != "unbounded" and config.backdrop is None:
+    if _ends_on_surface(config):
         starts, ends = (x.at[-1].set(warp.far) for x in (starts, ends))
     points = jax.vmap(polylines.point_at, in_axes=(None, 0))(line, 0.5 * (starts + ends))
     turns = jitter.rotations + _PATTERN_TURN * (jnp.arange(count, dtype=t.dtype) % 2)
@@ -363,6 +370,12 @@ def sample(
         return scene_bounds.to_unit_cube(domain(config), world)
 
     return Samples(s, t, jax.vmap(cone)(starts, ends, turns), points)
+
+
+def _ends_on_surface(config: ModelConfig) -> bool:
+    """Returns whether the last interval stands for a surface at its end."""
+    bounded = config.space != "unbounded" and config.backdrop is None
+    return bounded and config.last_sample == "end"
 
 
 def _draw(

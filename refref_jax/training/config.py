@@ -49,6 +49,9 @@ _FAR_FIELD = (
 # Options that determine the near and far planes, which earlier runs lack, and which the model has.
 _BOUNDS = ("scene", "properties", "background", "radius", "contraction")
 
+# Options that determine the number of samples.
+_SAMPLES = ("preset", "field", "background", "paths", "interior", "contraction", "far_field")
+
 # Maximum number of steps, rays and batches, which are 32-bit integers.
 _MOST = 2**31 - 1
 
@@ -199,9 +202,7 @@ class FieldConfig:
     )
     tints: choices.Tints | None = option(None, after=(*_OBJECTS, "paths", "max_bends", "interior"))
     footprint: choices.Footprint | None = option(None, after=("preset", "field"))
-    samples_per_ray: tuple[int, ...] | None = option(
-        None, formerly="samples", after=("preset", "field")
-    )
+    samples_per_ray: tuple[int, ...] | None = option(None, formerly="samples", after=_SAMPLES)
     multisamples: int | None = option(None, after=("preset", "field"))
     log2_hashmap_size: int | None = option(None, formerly="entries", after=("preset", "field"))
     max_res: int | None = option(None, formerly="finest", after=("preset", "field"))

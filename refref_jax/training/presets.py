@@ -17,7 +17,8 @@
 These are the sizes of Zip-NeRF's fields (`fields/zipnerf.py`). The sizes of another field kind are
 in its own module; those of `paper` are the published ones.
 
-Samples are per path, for each proposal level and the radiance field; `multi` is the number of
+Samples are per path, for each proposal level and the radiance field; `tiny` takes 16 + 8 where
+nothing is in front of the walls (`Preset.samples_to_walls`). `multi` is the number of
 multisamples per interval; the hash map size is the number of entries of a level. Values that depend
 on the scene are not part of a preset. For the complete published set-up, use the preset `paper`
 with the path settings `paper` and the interior `field`; leave these two out for other presets.
@@ -126,6 +127,18 @@ class Preset:
             last_sample="end",
             **dataclasses.asdict(bounds_),
         )
+
+    def samples_to_walls(self, model: ModelConfig) -> tuple[int, ...] | None:
+        """Returns the samples of each level if there is nothing in front of the walls.
+
+        Light paths end on the walls of a bounded or spherical scene, where the field is evaluated.
+        Returns `None` if this size is not known to need fewer samples then, or a model has other
+        paths, or samples inside the objects.
+        """
+        inside = model.interior == "field" or model.field_parts
+        if inside or model.space == "unbounded":
+            return None
+        return registry.KINDS[model.field.kind].sizes[self.size].samples_to_walls
 
 
 def bounds(

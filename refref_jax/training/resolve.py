@@ -239,19 +239,13 @@ def _resolve_paths(
     settings = make_path_settings(
         require(paths.name), min_throughput=paths.min_throughput, max_bends=paths.max_bends
     )
-    if settings.max_bends == 0:
+    if settings.max_bends:
+        why = "light may meet the objects again"
+        if found.reentry == "impossible":
+            why = "light that has left one convex object meets none again"
+        config = _decide(config, reasons, why, reentry=found.reentry)
+    else:
         _check_straight(config)
-        return settings, _decide(
-            config,
-            reasons,
-            f"paths={paths.name}",
-            min_throughput=settings.min_throughput,
-            max_bends=0,
-        )
-    why = "light may meet the objects again"
-    if found.reentry == "impossible":
-        why = "light that has left one convex object meets none again"
-    config = _decide(config, reasons, why, reentry=found.reentry)
     why = f"paths={paths.name}"
     return settings, _decide(
         config, reasons, why, min_throughput=settings.min_throughput, max_bends=settings.max_bends
@@ -323,15 +317,13 @@ def _resolve_model(
     fields = () if model.interior == "field" else facts.analysis.field_parts
     model = dataclasses.replace(model, learned_tints=learned, field_parts=fields)
     config = _resolve_far_field(config, facts, reasons)
+    if config.model.far_field == "field" and _is_surface_alone(config, facts)[0]:
+        why = f"preset={config.model.preset}, and only the background is behind the objects"
+        config = _decide(config, reasons, why, samples_per_ray=preset.samples_to_walls(model))
     in_front: choices.InFront = "field" if _in_front(config, facts) else "nothing"
     model = presets.override_model(model, config.model, in_front=in_front)
-    config = _decide(
-        config,
-        reasons,
-        f"preset={config.model.preset}",
-        **presets.sampling_of(model),
-    )
-    return model, config
+    why = f"preset={config.model.preset}"
+    return model, _decide(config, reasons, why, **presets.sampling_of(model))
 
 
 def _resolve_far_field(
@@ -399,12 +391,18 @@ def _choose_far_field(
     if given:
         choice: choices.FarField = "backdrop" if given[0] in BACKDROP_ONLY else "field"
         return choice, f"{given[0]} is an option of a {choice}"
+    alone, why = _is_surface_alone(config, facts)
+    return "backdrop" if alone else "field", why
+
+
+def _is_surface_alone(config: TrainConfig, facts: SceneFacts) -> tuple[bool, str]:
+    """Returns whether behind the objects is but the background's surface, and the reason."""
     if facts.misfits is None or not facts.stated:
-        return "field", "the scene does not state what is behind the objects"
+        return False, "the scene does not state what is behind the objects"
     surface = f"{choices.SURFACES[require(config.scene.space)]} that {facts.stated} states"
     if share := _share_of_misfits(config, facts):
-        return "field", f"{100.0 * share:.2g} % of the images' patches differ from the {surface}"
-    return "backdrop", f"behind the objects is the {surface}, as the images show"
+        return False, f"{100.0 * share:.2g} % of the images' patches differ from the {surface}"
+    return True, f"behind the objects is the {surface}, as the images show"
 
 
 def _share_of_misfits(config: TrainConfig, facts: SceneFacts) -> float:

@@ -66,8 +66,8 @@ def _in_unit_cube(point):
     return 0.5 * np.asarray(point) / MODEL.radius + 0.5
 
 
-def _render_painted(monkeypatch, config, path, *, offset=0.0, fog=0.0):
-    """Renders a field whose colour is the position, times a parameter; density is `fog`."""
+def _paint(monkeypatch, fog):
+    """Has all fields show the position as colour, times a parameter, and the density `fog`."""
 
     def radiance(strength, field, gaussians, direction):
         del field, direction
@@ -76,6 +76,11 @@ def _render_painted(monkeypatch, config, path, *, offset=0.0, fog=0.0):
 
     monkeypatch.setattr(registry, "density", lambda strength, *_: jnp.full_like(strength, fog))
     monkeypatch.setattr(registry, "radiance", radiance)
+
+
+def _render_painted(monkeypatch, config, path, *, offset=0.0, fog=0.0):
+    """Returns the colour of a path, and a function of its derivatives."""
+    _paint(monkeypatch, fog)
     paths = made_paths.stack([path])
     jitter = Jitter(jnp.full((1, 2), offset, jnp.float32), jnp.full((1, 2), 0.2, jnp.float32))
 
@@ -109,6 +114,30 @@ def test_an_opaque_surface_is_seen_where_the_path_ends_on_it(monkeypatch):
     point = np.asarray(path.points[2]) + 2.0 * np.asarray(path.directions[2])
     got, _ = _render_painted(monkeypatch, _END, stopped)
     np.testing.assert_allclose(got, _in_unit_cube(point), atol=_ROUNDING)
+
+
+def _distances(monkeypatch, config, path, *, fog=0.0):
+    """Returns the median and mean distances of a path."""
+    _paint(monkeypatch, fog)
+    params = Params(proposals=(jnp.float32(1.0),), field=jnp.float32(1.0))
+    paths, jitter = made_paths.stack([path]), Jitter(*jnp.zeros((2, 1, 2), jnp.float32))
+    seen = pixels.render_paths(params, config, paths, jitter, anneal=jnp.float32(1.0)).composite
+    return np.array([seen.median[0], seen.mean[0]])
+
+
+@pytest.mark.parametrize("samples", [2, 5])
+@pytest.mark.parametrize(("space", "order"), [("bounded", np.inf), ("spherical", 2)])
+def test_a_wall_is_as_far_as_the_end_of_the_path(monkeypatch, space, order, samples):
+    config = dataclasses.replace(_END, space=space, samples=samples)
+    arc = _exit(_bent(), order)[1]
+    np.testing.assert_allclose(_distances(monkeypatch, config, _bent()), arc, rtol=1e-5)
+    middle = dataclasses.replace(config, last_sample="middle")
+    assert np.all(_distances(monkeypatch, middle, _bent()) < arc - 0.1)
+
+
+def test_the_distance_of_what_is_in_front_of_the_wall_is_as_before(monkeypatch):
+    seen = [_distances(monkeypatch, config, _bent(), fog=1e3) for config in (_MIDDLE, _END)]
+    np.testing.assert_array_equal(*seen)
 
 
 def test_what_is_in_front_of_the_wall_hides_it_as_before(monkeypatch):

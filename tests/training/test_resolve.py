@@ -152,6 +152,39 @@ def test_a_background_beside_the_objects_may_be_a_backdrop(stated, share, expect
 
 
 @pytest.mark.parametrize(
+    ("found", "share", "given", "expected"),
+    [
+        (_CLEAR, 0.0, {}, (16, 8)),
+        (_TINTED, 0.0, {"paths": "paper"}, (16, 8)),
+        (_CLEAR._replace(space="spherical"), 0.0, {}, (16, 8)),
+        (_CLEAR._replace(space="unbounded"), 0.0, {}, (32, 20)),
+        (_CLEAR, 0.5, {}, (32, 20)),
+        (_CLEAR, 0.0, {"interior": "field"}, (32, 20)),
+        (_CLEAR, 0.0, {"paths": "straight"}, (32, 20)),
+        (_CLEAR, 0.0, {"contraction": "always"}, (32, 20)),
+        (_CLEAR, 0.0, {"samples_per_ray": (9, 7)}, (9, 7)),
+        (_CLEAR, 0.0, {"preset": "small"}, (48, 32)),
+        (_CLEAR._replace(field_parts=(0,)), 0.0, {}, (32, 20)),
+    ],
+)
+def test_a_field_that_only_shows_walls_needs_few_samples(found, share, given, expected):
+    facts = SceneFacts(
+        found, CAMERAS, (), None, None, (), stated="scene.json", misfits=lambda **bounds: share
+    )
+    made = resolve(TrainConfig().override(batch=64, far_field="field", **given), facts)
+    assert made.config.model.samples_per_ray == samples_of(made.model.config) == expected
+    unstated = resolve(made.config.override(samples_per_ray=None), facts._replace(stated=""))
+    assert unstated.config.model.samples_per_ray != (16, 8)
+
+
+@pytest.mark.parametrize("given", [{"paths": "straight"}, {"background": "unbounded"}])
+def test_the_number_of_samples_is_decided_again_with_what_it_follows_from(given):
+    config = TrainConfig().decided(samples_per_ray=(16, 8), far_field="field", paths="tree")
+    assert config.override(**given).model.samples_per_ray is None
+    assert config.override(samples_per_ray=(5, 4), **given).model.samples_per_ray == (5, 4)
+
+
+@pytest.mark.parametrize(
     ("given", "option"),
     [
         ({"paths": "straight", "interior": "absorbing"}, "interior=absorbing"),
@@ -258,11 +291,8 @@ def test_resolve_refuses_what_can_not_be(found, given, message):
 def test_override_takes_decisions_again_that_follow_from_a_change():
     config = _resolve(_TINTED, scene="a").config
     paper = config.override(paths="paper")
-    assert (paper.paths.min_throughput, paper.model.interior, paper.model.samples_per_ray) == (
-        None,
-        None,
-        (32, 20),
-    )
+    open_ = paper.paths.min_throughput, paper.model.interior, paper.model.samples_per_ray
+    assert (open_, paper.model.multisamples) == ((None, None, None), 1)
     assert config.override(paths="tree", steps=2500) == config
     shorter = config.override(steps=100).schedule
     assert (shorter.warmup, shorter.anneal, shorter.peak) == (None, None, 1e-2)
