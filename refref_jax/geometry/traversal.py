@@ -38,6 +38,9 @@ PACKET = 16
 _VISITS = 2
 """Number of nodes visited in one iteration of the loop."""
 
+# Options with which Warp compiles operations as they are written.
+_WARP_OPTIONS = {"enable_backward": False, "fuse_fp": False, "fast_math": False}
+
 _DONE = bvh_nodes.OCTANTS
 """Octant of a ray whose traversal is complete."""
 
@@ -376,8 +379,7 @@ def _warp_walk() -> Any:
         distances[ray] = distance
         primitive_ids[ray] = primitive_id
 
-    options = {"enable_backward": False, "fuse_fp": False, "fast_math": False}
-    kernel = wp.kernel(traversal, module="unique", module_options=options)
+    kernel = wp.kernel(traversal, module="unique", module_options=_WARP_OPTIONS)
     return wp.jax_kernel(kernel, num_outputs=2, vmap_method="sequential")
 
 

@@ -47,8 +47,11 @@ def _torus():
 def _touching_boxes():
     """Returns two boxes that share a wall."""
     box = trimesh.creation.box(extents=(1, 1, 1)).triangles
-    return np.concatenate([box - [0.5, 0, 0], box + [0.5, 0, 0]])
+    shift = np.array([0.5, 0.0, 0.0])
+    return np.concatenate([box - shift, box + shift])
 
+
+_FAR = np.array([1000.0, -2000.0, 500.0])
 
 _SCENES = {
     "ball": lambda: trimesh.creation.icosphere(3).triangles,
@@ -57,7 +60,7 @@ _SCENES = {
     "coincident faces": lambda: np.concatenate([_torus(), _torus()]),
     "touching boxes": _touching_boxes,
     "soup, partly degenerate": _soup,
-    "far from the origin": lambda: trimesh.creation.icosphere(3).triangles + [1000, -2000, 500],
+    "far from the origin": lambda: trimesh.creation.icosphere(3).triangles + _FAR,
     "one triangle": lambda: _soup()[-1:],
     "empty": lambda: np.zeros((0, 3, 3)),
 }
