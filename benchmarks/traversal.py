@@ -12,8 +12,14 @@ installed. All must run on one core, which the caller has to ensure; a core shar
 processes slows wide arithmetic more than it slows Embree.
 
 With `--any_speed` the table is printed and only the hits are asserted.
+
+With `--warp` the same rays are traced by the kernel of NVIDIA Warp (`REFREF_TRAVERSAL=warp`), which
+traces one after the other on a CPU, and in lock-step, as pure JAX does on a GPU. The claim is then
+that the kernel finds the hits of the packets, except for ties within rounding, and has at least a
+quarter of their speed and three times that of the lock-step. Its rays are not sorted.
 """
 
+import functools
 import importlib.util
 import time
 from collections.abc import Callable
@@ -28,12 +34,14 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from benchmarks import ray_sorting
-from refref_jax.geometry import bvh, bvh_build
+from refref_jax.geometry import bvh, bvh_build, bvh_nodes, traversal
 from refref_jax.geometry.rays import Rays
 
 _ROUNDS = flags.DEFINE_integer("rounds", 15, "Timed repeats of every case.")
 _MESHES = flags.DEFINE_list("meshes", [], "Meshes to trace; all by default.")
 _ANY_SPEED = flags.DEFINE_bool("any_speed", False, "Assert nothing about the speed.")
+
+_WARP = flags.DEFINE_bool("warp", False, "Compare packets with Warp and the lock-step instead.")
 
 _SIDE = 512
 _COUNT = _SIDE * _SIDE
@@ -46,6 +54,9 @@ _CAMERA_LIMIT = 0.9
 _LARGE_CAMERA_LIMIT = 0.65
 _LARGE = 150_000
 _SHUFFLED_LIMIT = 0.55
+
+_WARP_LIMIT = 0.25
+_LOCKSTEP_LIMIT = 3.0
 
 
 class _Case(NamedTuple):
@@ -163,10 +174,7 @@ def _compare(hits: bvh.Hits, theirs: dict) -> None:
 
 def _measure(case: _Case, tree: bvh.BVH, scene: EmbreeScene) -> tuple[float, float]:
     """Returns seconds for all rays, ours and Embree's."""
-    limits, exclude_primitive = (
-        jnp.full(_COUNT, jnp.inf),
-        jnp.full(_COUNT, bvh.NO_PRIMITIVE, jnp.int32),
-    )
+    limits, exclude_primitive = _no_bounds()
     rays = jax.tree.map(jnp.asarray, case.rays)
 
     def theirs() -> dict:
@@ -181,11 +189,91 @@ def _measure(case: _Case, tree: bvh.BVH, scene: EmbreeScene) -> tuple[float, flo
     return mine, embree
 
 
+def _lockstep(tree: bvh.BVH, rays: Rays) -> tuple[jax.Array, jax.Array]:
+    return jax.vmap(traversal.trace_ray, in_axes=(None, None, 0, 0, 0, 0))(*_of(tree, rays))
+
+
+def _in_warp(tree: bvh.BVH, rays: Rays) -> tuple[jax.Array, jax.Array]:
+    return traversal.trace_in_warp(*_of(tree, rays))
+
+
+def _of(tree: bvh.BVH, rays: Rays) -> tuple[jax.Array, ...]:
+    """Returns the arguments of a traversal."""
+    nodes = tree.nodes.reshape(-1, bvh_nodes.WORDS)
+    return nodes, tree.facets, rays.origins, rays.directions, *_no_bounds()
+
+
+def _no_bounds() -> tuple[jax.Array, jax.Array]:
+    """Returns limits, and primitives to exclude."""
+    return jnp.full(_COUNT, jnp.inf), jnp.full(_COUNT, bvh.NO_PRIMITIVE, jnp.int32)
+
+
+def _compare_with_warp() -> None:
+    """Prints rates of packets, of the kernel and of the lock-step, and asserts the claim."""
+    warp, lockstep = jax.jit(_in_warp), jax.jit(_lockstep)
+    limits, exclude_primitive = _no_bounds()
+    print("mesh        rays      packets    Warp  lock-step  Warp/packets  Warp/lock-step  slots")
+    missed = []
+    for name in _MESHES.value or _ALL:
+        triangles = _ALL[name]().astype(np.float32)
+        tree = jax.tree.map(jnp.asarray, bvh_build.build(triangles)[0])
+        for case in _cases(triangles, _embree(triangles)):
+            rays = jax.tree.map(jnp.asarray, case.rays)
+            packets = functools.partial(
+                case.trace, tree, rays, limits=limits, exclude_primitive=exclude_primitive
+            )
+            runs = (
+                packets,
+                functools.partial(warp, tree, rays),
+                functools.partial(lockstep, tree, rays),
+            )
+            other = _different_slots(*(jax.block_until_ready(run()) for run in runs[:2]))
+            runs[2]()
+            seconds = [[_seconds(run) for run in runs] for _ in range(_ROUNDS.value)]
+            mine, theirs, slow = np.median(seconds, axis=0)
+            rates = " ".join(f"{_COUNT / each / 1e6:9.2f}" for each in (mine, theirs, slow))
+            ratios = f"{mine / theirs:9.2f} {slow / theirs:14.1f}"
+            print(f"{name:11s} {case.name:8s} {rates} {ratios} {other:9d}")
+            if mine < _WARP_LIMIT * theirs or slow < _LOCKSTEP_LIMIT * theirs:
+                missed.append(f"{name}, {case.name}")
+    assert _ANY_SPEED.value or not missed, f"Warp is too slow: {'; '.join(missed)}"
+
+
+def _different_slots(hits: bvh.Hits, found: tuple[jax.Array, jax.Array]) -> int:
+    """Asserts that hits are the same except for ties within rounding, and returns their number."""
+    distances, primitive_ids = np.asarray(hits.distances), np.asarray(hits.primitive_ids)
+    theirs, slots = map(np.asarray, found)
+    hit = np.isfinite(distances)
+    assert np.mean(hit != np.isfinite(theirs)) <= 1e-5
+    both = hit & np.isfinite(theirs)
+    np.testing.assert_allclose(theirs[both], distances[both], rtol=1e-4, atol=1e-5)
+    different = int(np.sum(slots[both] != primitive_ids[both]))
+    assert different <= 1e-4 * _COUNT
+    return different
+
+
+def _embree(triangles: np.ndarray) -> EmbreeScene:
+    scene = EmbreeScene()
+    TriangleMesh(scene, triangles)
+    return scene
+
+
+def _cases(triangles: np.ndarray, scene: EmbreeScene) -> tuple[_Case, _Case]:
+    plain, sorted_first = jax.jit(bvh.closest_hits), jax.jit(ray_sorting.closest_hits_sorted)
+    camera = _LARGE_CAMERA_LIMIT if len(triangles) > _LARGE else _CAMERA_LIMIT
+    shuffled = _inner_rays(triangles, scene)
+    return (
+        _Case("camera", _camera_rays(), plain, camera),
+        _Case("shuffled", shuffled, sorted_first, _SHUFFLED_LIMIT),
+    )
+
+
 def main(arguments: list[str]) -> None:
     del arguments
+    if _WARP.value:
+        return _compare_with_warp()
     if importlib.util.find_spec("mitsuba") is None:
         print("Mitsuba is not installed and is omitted. `pip install mitsuba` adds it.")
-    plain, sorted_first = jax.jit(bvh.closest_hits), jax.jit(ray_sorting.closest_hits_sorted)
     print("mesh        build s  rays      Mrays/s  Embree  ratio  bound")
     missed = []
     for name in _MESHES.value or _ALL:
@@ -193,14 +281,8 @@ def main(arguments: list[str]) -> None:
         begin = time.perf_counter()
         tree = jax.tree.map(jnp.asarray, bvh_build.build(triangles)[0])
         build = time.perf_counter() - begin
-        scene = EmbreeScene()
-        TriangleMesh(scene, triangles)
-        camera = _LARGE_CAMERA_LIMIT if len(triangles) > _LARGE else _CAMERA_LIMIT
-        shuffled = _inner_rays(triangles, scene)
-        for case in (
-            _Case("camera", _camera_rays(), plain, camera),
-            _Case("shuffled", shuffled, sorted_first, _SHUFFLED_LIMIT),
-        ):
+        scene = _embree(triangles)
+        for case in _cases(triangles, scene):
             mine, embree = _measure(case, tree, scene)
             ratio = embree / mine
             rates = f"{_COUNT / mine / 1e6:7.2f} {_COUNT / embree / 1e6:7.2f}"

@@ -1,4 +1,4 @@
-"""Settings of XLA: loops compiled as one native function, and a flag for versions slow on GPUs.
+"""Settings of compilation: native loops, a flag for versions slow on GPUs, who traces rays.
 
 XLA:CPU runs a `while_loop` as many small kernels, dispatched one by one. A call with the attribute
 set by `native_loop` is instead emitted as one function with real control flow, which makes BVH
@@ -8,13 +8,16 @@ ignore it, and only the speed changes.
 Some versions compile scatter-adds of single floats for NVIDIA GPUs as loops that compare and swap,
 hundreds of times slower than an addition in memory. `add_missing_flag` sets the flag that they
 need, before JAX starts.
+
+The environment variable `REFREF_TRAVERSAL` chooses how closest hits are found. Programs that are
+compiled already keep what they were compiled with.
 """
 
 import importlib.metadata
 import os
 import warnings
 from collections.abc import Callable
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, Literal, ParamSpec, TypeVar
 
 import jax
 from jax._src import xla_bridge
@@ -30,6 +33,12 @@ ATOMICS_FLAG = "--xla_backend_extra_options=-nvptx-allow-ftz-atomics"
 _ENOUGH = ("nvptx-allow-ftz-atomics", "--xla_gpu_ftz=true")
 
 _PLUGINS = ("jax-cuda12-plugin", "jax-cuda13-plugin")
+
+TRAVERSAL = "REFREF_TRAVERSAL"
+"""Environment variable: `xla`, the default, or `warp`."""
+
+# Older versions do not offer kernels to JAX on CPUs.
+_WARP = (1, 19)
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
@@ -98,6 +107,27 @@ def add_missing_flag() -> None:
         )
         return
     os.environ["XLA_FLAGS"] = f"{flags} {ATOMICS_FLAG}".strip()
+
+
+def chosen_traversal() -> Literal["xla", "warp"]:
+    """Returns who finds closest hits: JAX alone (`xla`), or a kernel of NVIDIA Warp (`warp`).
+
+    Raises:
+      ValueError: if `REFREF_TRAVERSAL` is anything else, or Warp is missing or too old.
+    """
+    chosen = os.environ.get(TRAVERSAL) or "xla"
+    if chosen == "xla":
+        return "xla"
+    if chosen != "warp":
+        raise ValueError(f"{TRAVERSAL} is {chosen!r}. Set it to xla or warp.")
+    version = _version("warp-lang")
+    if version is None or tuple(map(int, version.split(".")[:2])) < _WARP:
+        found = f"version {version} is installed" if version else "it is not installed"
+        raise ValueError(
+            f"{TRAVERSAL}=warp requires warp-lang 1.19 or newer, and {found}. Install it with "
+            f"pip install -e '.[warp]', or unset {TRAVERSAL}."
+        )
+    return "warp"
 
 
 def has_started() -> bool:

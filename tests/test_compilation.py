@@ -1,4 +1,4 @@
-"""The flag for versions of XLA that are slow on GPUs; loops are tested where they are used."""
+"""The flag for slow versions of XLA, and the choice of traversal; loops are tested where used."""
 
 import importlib.metadata
 import os
@@ -84,3 +84,39 @@ def test_it_is_known_whether_jax_has_started():
         [sys.executable, "-c", words], capture_output=True, text=True, check=True
     )
     assert answer.stdout.split() == ["False", "True"]
+
+
+@pytest.mark.parametrize("value", [None, "", "xla"])
+def test_rays_are_traced_by_jax_alone_unless_asked(installed, monkeypatch, value):
+    monkeypatch.delenv(compilation.TRAVERSAL, raising=False)
+    if value is not None:
+        monkeypatch.setenv(compilation.TRAVERSAL, value)
+    assert compilation.chosen_traversal() == "xla"
+
+
+def test_warp_is_chosen_if_it_is_there(installed, monkeypatch):
+    monkeypatch.setenv(compilation.TRAVERSAL, "warp")
+    installed["warp-lang"] = "1.20.1"
+    assert compilation.chosen_traversal() == "warp"
+
+
+@pytest.mark.parametrize(
+    ("value", "version", "message"),
+    [
+        ("Warp", "1.19.0", r"^REFREF_TRAVERSAL is 'Warp'\. Set it to xla or warp\.$"),
+        (
+            "warp",
+            None,
+            r"it is not installed\. Install it with pip install -e '\.\[warp\]', or unset",
+        ),
+        ("warp", "1.9.2", r"requires warp-lang 1\.19 or newer, and version 1\.9\.2 is installed"),
+    ],
+)
+def test_a_traversal_that_cannot_be_had_is_an_error(
+    installed, monkeypatch, value, version, message
+):
+    monkeypatch.setenv(compilation.TRAVERSAL, value)
+    if version:
+        installed["warp-lang"] = version
+    with pytest.raises(ValueError, match=message):
+        compilation.chosen_traversal()

@@ -27,6 +27,10 @@ STOP_WITH_INPUT = "REFREF_STOP_WITH_INPUT"
 """Environment variable: if it is set, a command stops when its standard input ends."""
 
 
+# `refref_jax.compilation.TRAVERSAL`, whose module imports JAX.
+_TRAVERSAL = "REFREF_TRAVERSAL"
+
+
 def run(main: Callable[..., None], *, arguments: Sequence[str] = (), again: str = "") -> None:
     """Runs a command; invalid input and unreadable files end it with one line.
 
@@ -47,6 +51,8 @@ def run(main: Callable[..., None], *, arguments: Sequence[str] = (), again: str 
         if importlib.util.find_spec("jax_plugins"):  # JAX may run on a GPU
             importlib.import_module("refref_jax.compilation").add_missing_flag()
         try:
+            if _TRAVERSAL in os.environ:
+                importlib.import_module("refref_jax.compilation").chosen_traversal()
             main(*words[1:])
         except (ValueError, OSError) as error:
             fail(str(error))

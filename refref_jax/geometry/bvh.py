@@ -1,8 +1,9 @@
 """Closest hits of rays with a packed bounding volume hierarchy (BVH) of triangles.
 
 On a CPU, packets of rays traverse the tree together; on an accelerator, every ray traverses it
-alone and all rays run in lock-step (`traversal`). `bvh_nodes` describes the memory layout of the
-tree, `bvh_build` its construction.
+alone and all rays run in lock-step (`traversal`). With the environment variable
+`REFREF_TRAVERSAL=warp`, a kernel of NVIDIA Warp finds the hits instead, on CPUs and NVIDIA GPUs.
+`bvh_nodes` describes the memory layout of the tree, `bvh_build` its construction.
 
 `closest_hits` takes a batch of rays with one leading axis. `closest_primitive` takes one ray, for
 use under `vmap` and differentiation: under any nesting of `vmap`, all rays are cast as one batch.
@@ -10,6 +11,7 @@ The triangle that is hit is a constant for differentiation: recompute the hit po
 triangle to obtain gradients.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -17,6 +19,7 @@ import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int
 
+from refref_jax import compilation
 from refref_jax.geometry import bvh_nodes, traversal
 from refref_jax.geometry import triangles as prepared
 from refref_jax.geometry.rays import Rays
@@ -96,10 +99,17 @@ def closest_hits(
         directions,
         limits,
         exclude_primitive,
-        cpu=_closest_in_packets,
+        **_traversals(),
         default=jax.vmap(traversal.trace_ray, in_axes=(None, None, 0, 0, 0, 0)),
     )
     return _finish(bvh, origins, directions, distances, primitive_ids)
+
+
+def _traversals() -> dict[str, Callable[..., Any]]:
+    """Returns the traversal of each kind of device that has one of its own."""
+    if compilation.chosen_traversal() == "warp":
+        return {"cpu": traversal.trace_in_warp, "cuda": traversal.trace_in_warp}
+    return {"cpu": _closest_in_packets}
 
 
 def _finite(vectors: Float[Array, "rays 3"]) -> Bool[Array, " rays"]:

@@ -29,8 +29,8 @@ from refref_jax import numerics
 # last place of the second. Two units cover both.
 _SLACK = 2.4e-7
 
-# Two roundings up on the far side, so that a triangle that lies in a box face is never culled.
-_FAR_PADDING = 1.0000004
+FAR_PADDING = 1.0000004
+"""Two roundings up on the far side, so that a triangle that lies in a box face is never culled."""
 
 OCTANTS = 8
 
@@ -95,7 +95,7 @@ def overlaps(
     enter_x, enter_y, enter_z = entry.astype(kind) * ray.reciprocals - ray.entries
     leave_x, leave_y, leave_z = exit.astype(kind) * ray.reciprocals - ray.exits
     near = _larger(_larger(enter_x, enter_y), _larger(enter_z, jnp.zeros_like(enter_z)))
-    far = _smaller(_smaller(leave_x, leave_y), leave_z) * _FAR_PADDING
+    far = _smaller(_smaller(leave_x, leave_y), leave_z) * FAR_PADDING
     return near <= _smaller(far, limit)
 
 

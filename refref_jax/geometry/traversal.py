@@ -1,5 +1,7 @@
 """Traversal of the BVH: packets of rays on CPUs, single rays in lock-step on accelerators.
 
+As an option, a kernel of NVIDIA Warp traces single rays, each in a thread of its own on a GPU.
+
 The rays of a packet share one node index, and the packet descends where any of its rays hits. Rays
 are stored component by component, so that XLA turns each operation of the single-ray functions in
 `bvh_nodes` and `triangles` into one vector instruction. Packets are traced one after the other; the
@@ -11,11 +13,17 @@ the tree once for each, with the other rays masked.
 On an accelerator, the state of a ray's loop is a row of the node table and the closest hit so far.
 Under `vmap`, `trace_ray` becomes one loop over all rays, which ends with the slowest ray.
 
+The kernel (`trace_in_warp`) is `trace_ray` again, over the same tables and with the same rules of
+edges, ties and of the triangle that a ray leaves: a change of one is a change of both. It is
+compiled without fused multiply-adds, so that its distances are the bits of the formulas in
+`triangles`, computed operation by operation.
+
 Source: Wald et al., Interactive Rendering with Coherent Ray Tracing (2001), for packets; Smits,
 Efficiency Issues for Ray Tracing (1998), for skip pointers.
 """
 
-from typing import NamedTuple
+import functools
+from typing import Any, NamedTuple, no_type_check
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +37,9 @@ PACKET = 16
 
 _VISITS = 2
 """Number of nodes visited in one iteration of the loop."""
+
+# Options with which Warp compiles operations as they are written.
+_WARP_OPTIONS = {"enable_backward": False, "fuse_fp": False, "fast_math": False}
 
 _DONE = bvh_nodes.OCTANTS
 """Octant of a ray whose traversal is complete."""
@@ -281,3 +292,148 @@ def _test_leaf_of_ray(
         distance = jnp.where(closer, found, distance)
         primitive_id = jnp.where(closer, candidate, primitive_id)
     return distance, primitive_id
+
+
+def trace_in_warp(
+    nodes: Int[Array, "rows 8"],
+    packed: Float[Array, "primitives 12"],
+    origins: Float[Array, "rays 3"],
+    directions: Float[Array, "rays 3"],
+    limits: Float[Array, " rays"],
+    exclude_primitive: Int[Array, " rays"],
+) -> tuple[Float[Array, " rays"], Int[Array, " rays"]]:
+    """Traces rays by the kernel of Warp, on a CPU or an NVIDIA GPU.
+
+    Arguments and results are those of `trace_ray`, for many rays.
+
+    Raises:
+      TypeError: if the rays are not in single precision.
+    """
+    if origins.dtype != jnp.float32:
+        raise TypeError(
+            f"The traversal in Warp takes rays of float32, not {origins.dtype}. Convert them, or "
+            "unset REFREF_TRAVERSAL."
+        )
+    rows = nodes.shape[0] // bvh_nodes.OCTANTS
+    roots = rows * jax.vmap(bvh_nodes.octant)(directions)
+    distances, primitive_ids = _warp_walk()(
+        nodes.reshape(-1, 4),
+        packed.reshape(-1, 4),
+        jnp.where(limits >= 0.0, roots, roots + rows - 1),
+        roots + rows - 1,
+        origins,
+        directions,
+        *jax.vmap(bvh_nodes.slabs)(origins, directions),
+        limits,
+        exclude_primitive,
+        launch_dims=limits.shape[0],
+        output_dims=limits.shape[0],
+    )
+    return distances, primitive_ids
+
+
+@functools.cache
+@no_type_check
+def _warp_walk() -> Any:
+    """Returns the kernel as a function of JAX arrays; two rows are a node, three a triangle."""
+    import warp as wp
+
+    if wp.config.log_level == wp.LOG_INFO:
+        wp.config.log_level = wp.LOG_WARNING  # else it prints its devices and compilations
+    overlaps, distance_to = _warp_overlaps(), _warp_distance()
+    leaf_size, none = bvh_nodes.LEAF_SIZE, bvh_nodes.NONE
+
+    def traversal(
+        nodes: wp.array(dtype=wp.vec4i),
+        packed: wp.array(dtype=wp.vec4f),
+        starts: wp.array(dtype=wp.int32),
+        ends: wp.array(dtype=wp.int32),
+        origins: wp.array(dtype=wp.vec3f),
+        directions: wp.array(dtype=wp.vec3f),
+        reciprocals: wp.array(dtype=wp.vec3f),
+        entries: wp.array(dtype=wp.vec3f),
+        exits: wp.array(dtype=wp.vec3f),
+        limits: wp.array(dtype=wp.float32),
+        exclude_primitive: wp.array(dtype=wp.int32),
+        distances: wp.array(dtype=wp.float32),
+        primitive_ids: wp.array(dtype=wp.int32),
+    ):
+        ray = wp.tid()
+        node = starts[ray]
+        distance = limits[ray]
+        primitive_id = wp.int32(none)
+        while node < ends[ray]:
+            low, high = nodes[2 * node], nodes[2 * node + 1]
+            if overlaps(reciprocals[ray], entries[ray], exits[ray], low, high, distance):
+                node += 1
+                if high[3] > 0:
+                    for offset in range(leaf_size):
+                        at = high[3] - 1 + offset
+                        found = distance_to(origins[ray], directions[ray], packed, at)
+                        closer = found < distance or (found == distance and at < primitive_id)
+                        if closer and at != exclude_primitive[ray]:
+                            distance = found
+                            primitive_id = at
+            else:
+                node = high[2]
+        distances[ray] = distance
+        primitive_ids[ray] = primitive_id
+
+    kernel = wp.kernel(traversal, module="unique", module_options=_WARP_OPTIONS)
+    return wp.jax_kernel(kernel, num_outputs=2, vmap_method="sequential")
+
+
+@no_type_check
+def _warp_overlaps() -> Any:
+    """Returns `bvh_nodes.overlaps` in Warp; a node is two rows of four words."""
+    import warp as wp
+
+    far_padding = bvh_nodes.FAR_PADDING
+
+    @wp.func
+    def overlaps(
+        reciprocals: wp.vec3f,
+        entries: wp.vec3f,
+        exits: wp.vec3f,
+        low: wp.vec4i,
+        high: wp.vec4i,
+        limit: wp.float32,
+    ):
+        enter_x = wp.cast(low[0], wp.float32) * reciprocals[0] - entries[0]
+        enter_y = wp.cast(low[1], wp.float32) * reciprocals[1] - entries[1]
+        enter_z = wp.cast(low[2], wp.float32) * reciprocals[2] - entries[2]
+        leave_x = wp.cast(low[3], wp.float32) * reciprocals[0] - exits[0]
+        leave_y = wp.cast(high[0], wp.float32) * reciprocals[1] - exits[1]
+        leave_z = wp.cast(high[1], wp.float32) * reciprocals[2] - exits[2]
+        near = wp.max(wp.max(enter_x, enter_y), wp.max(enter_z, 0.0))
+        far = wp.min(wp.min(leave_x, leave_y), leave_z) * far_padding
+        return near <= wp.min(far, limit)
+
+    return overlaps
+
+
+@no_type_check
+def _warp_distance() -> Any:
+    """Returns `triangles.distance` in Warp; a facet is three rows of four numbers."""
+    import warp as wp
+
+    edge_tolerance = triangles.EDGE_TOLERANCE
+
+    @wp.func
+    def distance(
+        origin: wp.vec3f, direction: wp.vec3f, packed: wp.array(dtype=wp.vec4f), facet: wp.int32
+    ):
+        a, b, c = packed[3 * facet], packed[3 * facet + 1], packed[3 * facet + 2]
+        to_corner = wp.vec3f(a[0], a[1], a[2]) - origin
+        normal = wp.vec3f(c[1], c[2], c[3])
+        moment = wp.cross(direction, to_corner)
+        determinant = wp.dot(direction, normal)
+        side = wp.where(determinant < 0.0, -1.0, 1.0)
+        u = wp.dot(moment, wp.vec3f(b[2], b[3], c[0])) * side
+        v = wp.dot(moment, wp.vec3f(a[3], b[0], b[1])) * side
+        reach, area = wp.dot(to_corner, normal) * side, wp.abs(determinant)
+        outside = wp.min(wp.min(u, v), area - (u + v))
+        hit = wp.min(reach, area) > 0.0 and outside >= -edge_tolerance * area
+        return wp.where(hit, reach, wp.inf) / area
+
+    return distance

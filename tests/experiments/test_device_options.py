@@ -1,6 +1,7 @@
 """The options of several devices and processes, and a training that one of them interrupts."""
 
 import json
+import os
 import signal
 import socket
 import subprocess
@@ -13,6 +14,7 @@ from absl.testing import flagsaver
 
 from experiments.cli import flags as cli_flags
 from experiments.runs import processes
+from refref_jax import compilation
 from tests.processes import code_generator
 from tests.processes.command import ROOT, run_command
 
@@ -45,6 +47,14 @@ def test_options_that_make_no_sense_are_not_taken(options, message):
         flagsaver.flagsaver(**options),
     ):
         pass
+
+
+def test_a_traversal_that_does_not_exist_is_refused_before_anything_begins(ball_scene, tmp_path):
+    environment = os.environ | {compilation.TRAVERSAL: "fast"}
+    ended = run_command(
+        "render_known", f"--scene={ball_scene}", f"--out={tmp_path}", fails=True, env=environment
+    )
+    assert ended.stderr == "error: REFREF_TRAVERSAL is 'fast'. Set it to xla or warp.\n"
 
 
 def test_more_devices_than_there_are_are_refused():
