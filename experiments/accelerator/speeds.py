@@ -64,7 +64,9 @@ _ESTIMATES = {
     "tracing": {"tiny": "about 1.6", "paper": "about 5, or 1 to 2 in large blocks"},
 }
 
-_VIEWS, _CELLS = 8, 384
+# PSNR of the pixels that a backdrop is fitted to, dB; on a CPU it is 29.7 with few cells and views,
+# 37.0 with 384 and 8.
+_LEAST_PSNR = 25.0
 
 
 def environment(context: Context) -> Iterator[Row]:
@@ -175,14 +177,14 @@ def steps(context: Context, preset: str) -> Iterator[Row]:
     """Times training steps without tracing, and compares them with the bytes they move."""
     run, program = prepare_run(context, preset), compile_steps(context, preset)
     held, pretraced = jax.device_put((run.state, run.pretraced), context.device)
-    last = np.int32(run.batches)
+    count = min(run.batches, context.steps)
 
     def take() -> jax.Array:
         nonlocal held
-        held, report = program.call(held, pretraced, np.int32(0), last)
+        held, report = program.call(held, pretraced, np.int32(0), np.int32(count))
         return report.loss
 
-    seconds = best_of(take) / run.batches
+    seconds = best_of(take) / count
     estimate = _estimate(context, "steps", preset)
     yield Row(f"a step of {run.batch:,} rays", 1e3 * seconds, "ms", note=estimate)
     yield Row("rays per second, without tracing", run.batch / seconds / 1e3, "thousand")
@@ -220,43 +222,38 @@ def backdrop(context: Context) -> Iterator[Row]:
     asked = TrainConfig().override(scene=str(context.scene), far_field="backdrop", paths="tree")
     resolved, objects = fit.prepare(asked, report=lambda line: None)
     frames = scene_folder.read_frames(context.scene, "train")
-    cameras = frames.cameras._replace(poses=frames.cameras.poses[:_VIEWS])
-    photographs = scene_folder.read_images(frames._replace(images=frames.images[:_VIEWS]))
+    views, cells = context.sizes.views, context.sizes.cells
     domain = volume_rendering.domain(resolved.model.config)
 
     def trace() -> tuple[backdrop_equations.Block, ...]:
         return backdrop_equations.read(
             objects,
-            cameras,
-            photographs,
+            frames.cameras._replace(poses=frames.cameras.poses[:views]),
+            scene_folder.read_images(frames._replace(images=frames.images[:views])),
             settings=resolved.model.settings,
             domain=domain,
-            resolution=_CELLS,
+            resolution=cells,
         )
 
+    def solve() -> backdrop_solver.Progress:
+        shape = {"space": domain.space, "resolution": cells}
+        rounds = {"iterations": backdrop_solver.ROUND, "thinned_rounds": 0}
+        *_, last = backdrop_solver.solve(blocks, **shape, **rounds)
+        return last
+
     first, blocks = seconds_of(trace)
-    traced = best_of(trace)
-    yield Row("tracing a view", 1e3 * traced / len(photographs), "ms")
-    yield Row("compiling for it", max(0.0, first - traced), "s")
-    first, solved = seconds_of(lambda: _solve(blocks, domain.space))
-    taken = best_of(lambda: _solve(blocks, domain.space))
-    name = f"an iteration, {len(photographs)} views, {_CELLS} cells per side"
+    taken = best_of(trace)
+    yield Row("reading and tracing a view", 1e3 * taken / views, "ms")
+    yield Row("compiling for it", max(0.0, first - taken), "s")
+    first, solved = seconds_of(solve)
+    taken = best_of(solve)
+    name = f"an iteration, {views} views, {cells} cells per side"
     yield Row(name, 1e3 * taken / backdrop_solver.ROUND, "ms")
     yield Row("compiling for it", max(0.0, first - taken), "s")
-    good: Verdict = "ok" if solved.fitted > 30.0 else "problem"
-    yield Row("PSNR of the fitted pixels", solved.fitted, "dB", good, "at least 30")
+    verdict: Verdict = "ok" if solved.fitted > _LEAST_PSNR else "problem"
+    note = f"at least {_LEAST_PSNR:g}"
+    yield Row("PSNR of the fitted pixels", solved.fitted, "dB", verdict, note)
     yield from _peak(context)
-
-
-def _solve(blocks: tuple[backdrop_equations.Block, ...], space: str) -> backdrop_solver.Progress:
-    *_, last = backdrop_solver.solve(
-        blocks,
-        space=space,
-        resolution=_CELLS,
-        iterations=backdrop_solver.ROUND,
-        thinned_rounds=0,
-    )
-    return last
 
 
 def _program(program: Compiled, context: Context) -> Iterator[Row]:
