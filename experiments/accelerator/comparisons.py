@@ -127,7 +127,9 @@ def paths(context: Context) -> Iterator[Row]:
     yield Row("light paths", int(np.sum(counts[1])))
     yield limited("rays with another number of paths", 1.0 - float(np.mean(same)), _MOST_PATHS)
     off = float(np.max(np.abs(sums[1] - 1.0)))
-    yield limited("throughput of a ray's paths and what is dropped, from 1", off, _THROUGHPUT)
+    yield limited(
+        "throughput of a ray's paths plus dropped, largest difference from 1", off, _THROUGHPUT
+    )
     off = float(np.abs(np.mean(mine.dropped) - np.mean(theirs.dropped)))
     yield limited("mean dropped throughput, difference", off, _THROUGHPUT)
     off = np.linalg.norm(ends[1] - ends[0], axis=-1)[same]
@@ -238,7 +240,7 @@ def gradients(context: Context) -> Iterator[Row]:
     with jax.default_matmul_precision("highest"):
         found["highest"] = here(_uncompiled_steps(context), context.device)
     for precision, (mine_loss, mine) in found.items():
-        name, most = f"products in {precision} precision: ", _GRADIENT[precision]
+        name, most = f"matrix products in {precision} precision: ", _GRADIENT[precision]
         off = abs(mine_loss - loss) / loss
         yield limited(f"{name}relative difference of the loss", off, most / 10.0)
         off = relative_distance(mine, expected)

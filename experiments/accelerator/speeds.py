@@ -244,12 +244,12 @@ def backdrop(context: Context) -> Iterator[Row]:
     first, blocks = seconds_of(trace)
     taken = best_of(trace)
     yield Row("reading and tracing a view", 1e3 * taken / views, "ms")
-    yield Row("compiling for it", max(0.0, first - taken), "s")
+    yield Row("compiling tracing", max(0.0, first - taken), "s")
     first, solved = seconds_of(solve)
     taken = best_of(solve)
     name = f"an iteration, {views} views, {cells} cells per side"
     yield Row(name, 1e3 * taken / backdrop_solver.ROUND, "ms")
-    yield Row("compiling for it", max(0.0, first - taken), "s")
+    yield Row("compiling the solver", max(0.0, first - taken), "s")
     verdict: Verdict = "ok" if solved.fitted > _LEAST_PSNR else "problem"
     note = f"at least {_LEAST_PSNR:g}"
     yield Row("PSNR of the fitted pixels", solved.fitted, "dB", verdict, note)
