@@ -85,6 +85,16 @@ def with_record(values: Array, at: Array, value: Array) -> Array:
     return update(values, value, at, axis=0, allow_negative_indices=False)
 
 
+def is_flag_missing() -> bool:
+    """Returns whether this version of jaxlib is slow on NVIDIA GPUs without a flag not yet set.
+
+    Without a CUDA plugin, no flag is missing.
+    """
+    flags = os.environ.get("XLA_FLAGS", "")
+    slow = _version("jaxlib") in SLOW_ATOMICS and any(_version(each) for each in _PLUGINS)
+    return slow and not any(each in flags for each in _ENOUGH)
+
+
 def add_missing_flag() -> None:
     """Sets the flag of XLA that a slow version needs on NVIDIA GPUs; other versions refuse it.
 
@@ -94,15 +104,13 @@ def add_missing_flag() -> None:
     Source: openxla/xla#46225. With the flag, `atom.cas.b32` becomes `atom.add.f32` in the PTX of
     jaxlib 0.10.2 for an H100 (`benchmarks.gpu_scatter_adds`).
     """
-    flags, name = os.environ.get("XLA_FLAGS", ""), ATOMICS_FLAG.split("=")[0]
-    version = _version("jaxlib")
-    plugin = any(_version(each) for each in _PLUGINS)
-    if version not in SLOW_ATOMICS or not plugin or any(each in flags for each in _ENOUGH):
+    if not is_flag_missing():
         return
+    flags, name = os.environ.get("XLA_FLAGS", ""), ATOMICS_FLAG.split("=")[0]
     if has_started() or name in flags:
         warnings.warn(
-            f"jaxlib {version} is slow on NVIDIA GPUs: its scatter-adds compare and swap. Set "
-            f"XLA_FLAGS={ATOMICS_FLAG} before JAX starts, or install jax==0.10.1.",
+            f"jaxlib {_version('jaxlib')} is slow on NVIDIA GPUs: its scatter-adds compare and "
+            f"swap. Set XLA_FLAGS={ATOMICS_FLAG} before JAX starts, or install jax==0.10.1.",
             stacklevel=3,
         )
         return

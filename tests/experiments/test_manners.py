@@ -40,6 +40,7 @@ _IN_THE_WAY = {
     "glass_figures": (["--scene=x", "--out=FOLDER"], "glass_fan.jpg"),
     "metrics": (["x", "y", "--out=FOLDER/metrics.json"], "metrics.json"),
     "export": (["--run=x", "--what=mesh", "--out=FOLDER/a.ply"], "a.ply"),
+    "accelerator_check": (["--out=FOLDER"], "report.md"),
     "convert_lpips": (["--alexnet=x", "--lpips=x", "--out=FOLDER/a.npz"], "a.npz"),
     "dataset.check": (["FOLDER"], "check.html"),
 }
@@ -148,6 +149,7 @@ _MISTAKES = {
         "--out=OUT --scene=x --steps=many": "list of numbers",
         "--out=OUT --scene=nowhere": "nowhere/transforms_train.json does not exist",
     },
+    "accelerator_check": {"--out=OUT --presets=tiny,papper": "Did you mean paper?"},
     "recommend": {"--scene=nowhere --minutes=1": "nowhere/transforms_train.json does not exist"},
     "import_masks": {
         "--out=OUT --scene=nowhere --masks=x": "nowhere/transforms_train.json does not exist"
