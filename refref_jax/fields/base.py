@@ -107,7 +107,7 @@ class FieldSize(NamedTuple):
       multisamples: number of multisamples per interval.
       footprint: pixel footprint along a path, see `ModelConfig`.
       dilation: widening of a proposal before it is sampled, see `ModelConfig`.
-      samples_to_walls: as `samples`, for paths with nothing in front of the walls that they end on;
+      background_samples: as `samples`, for paths with nothing in front of the walls that they end on;
         `None` if fewer were not tried.
     """
 
@@ -117,7 +117,7 @@ class FieldSize(NamedTuple):
     multisamples: int
     footprint: Footprint
     dilation: float
-    samples_to_walls: tuple[int, ...] | None = None
+    background_samples: tuple[int, ...] | None = None
 
 
 class FieldKind(NamedTuple):

@@ -152,7 +152,7 @@ _TINY = FieldSize(
     multisamples=1,
     footprint="differential",
     dilation=0.0,
-    samples_to_walls=(16, 8),
+    background_samples=(16, 8),
 )
 
 _SMALL = FieldSize(

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from refref_jax import numerics
+from refref_jax.choices import LastSample
 from refref_jax.fields import base, registry
 from refref_jax.fields.base import Radiance
 from refref_jax.optics.light_paths import LightPaths
@@ -85,7 +86,7 @@ def composite(
     rgb: Float[Array, "samples 3"],
     edges: Float[Array, " samples+1"],
     *,
-    surface_at_end: bool = False,
+    last_sample: LastSample = "middle",
 ) -> Composite:
     """Sums the samples of a path.
 
@@ -93,15 +94,15 @@ def composite(
       weights: weights `w_i`.
       rgb: linear colours.
       edges: distances of the edges of the intervals.
-      surface_at_end: whether the last interval stands for a surface at its end, as in `sample`,
-        which is its distance then; by default every interval is at its middle.
+      last_sample: distance of the last interval: that of its `middle`, as for the others, or of its
+        `end`, if it stands for a surface there.
     """
     accumulation = jnp.sum(weights)
     places = 0.5 * (edges[1:] + edges[:-1])
     half = jnp.full((1,), 0.5, weights.dtype)
     level = numerics.safe_divide(half, accumulation[None])
     median = stepfun.invert_cdf(level, edges, stepfun.integrate_weights(weights))[0]
-    if surface_at_end:
+    if last_sample == "end":
         places = places.at[-1].set(edges[-1])
         median = jnp.where(jnp.sum(weights[:-1]) < 0.5, edges[-1], median)
     mean = numerics.safe_divide(jnp.sum(weights * places), accumulation)
@@ -189,7 +190,7 @@ def path_radiance(
     warp = distance_warp(config, line)
     samples, seen, histograms = _sampled(params, config, line, warp, jitter, anneal)
     weights = _weigh(config, seen.density, samples.t)
-    composited = composite(weights, seen.rgb, samples.t, surface_at_end=_ends_on_surface(config))
+    composited = composite(weights, seen.rgb, samples.t, last_sample=_last_sample(config))
     return PathRadiance(
         composite=_in_arc_length(line, composited),
         histograms=(*histograms, Histogram(samples.s, weights)),
@@ -360,7 +361,7 @@ def sample(
     s = stepfun.snap(_draw(config, histograms, strata, anneal), bends)
     t = scene_bounds.to_distance(warp, s)
     starts, ends = t[:-1], t[1:]
-    if _ends_on_surface(config):
+    if _last_sample(config) == "end":
         starts, ends = (x.at[-1].set(warp.far) for x in (starts, ends))
     points = jax.vmap(polylines.point_at, in_axes=(None, 0))(line, 0.5 * (starts + ends))
     turns = jitter.rotations + _PATTERN_TURN * (jnp.arange(count, dtype=t.dtype) % 2)
@@ -372,10 +373,10 @@ def sample(
     return Samples(s, t, jax.vmap(cone)(starts, ends, turns), points)
 
 
-def _ends_on_surface(config: ModelConfig) -> bool:
-    """Returns whether the last interval stands for a surface at its end."""
-    bounded = config.space != "unbounded" and config.backdrop is None
-    return bounded and config.last_sample == "end"
+def _last_sample(config: ModelConfig) -> LastSample:
+    """Returns where the last interval is: at its end only if there is a surface."""
+    surface = config.space != "unbounded" and config.backdrop is None
+    return config.last_sample if surface else "middle"
 
 
 def _draw(

@@ -18,7 +18,7 @@ These are the sizes of Zip-NeRF's fields (`fields/zipnerf.py`). The sizes of ano
 in its own module; those of `paper` are the published ones.
 
 Samples are per path, for each proposal level and the radiance field; `tiny` takes 16 + 8 where
-nothing is in front of the walls (`Preset.samples_to_walls`). `multi` is the number of
+nothing is in front of the walls (`Preset.background_samples`). `multi` is the number of
 multisamples per interval; the hash map size is the number of entries of a level. Values that depend
 on the scene are not part of a preset. For the complete published set-up, use the preset `paper`
 with the path settings `paper` and the interior `field`; leave these two out for other presets.
@@ -128,7 +128,7 @@ class Preset:
             **dataclasses.asdict(bounds_),
         )
 
-    def samples_to_walls(self, model: ModelConfig) -> tuple[int, ...] | None:
+    def background_samples(self, model: ModelConfig) -> tuple[int, ...] | None:
         """Returns the samples of each level if there is nothing in front of the walls.
 
         Light paths end on the walls of a bounded or spherical scene, where the field is evaluated.
@@ -138,7 +138,7 @@ class Preset:
         inside = model.interior == "field" or model.field_parts
         if inside or model.space == "unbounded":
             return None
-        return registry.KINDS[model.field.kind].sizes[self.size].samples_to_walls
+        return registry.KINDS[model.field.kind].sizes[self.size].background_samples
 
 
 def bounds(

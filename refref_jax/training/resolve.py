@@ -319,7 +319,7 @@ def _resolve_model(
     config = _resolve_far_field(config, facts, reasons)
     if config.model.far_field == "field" and _is_surface_alone(config, facts)[0]:
         why = f"preset={config.model.preset}, and only the background is behind the objects"
-        config = _decide(config, reasons, why, samples_per_ray=preset.samples_to_walls(model))
+        config = _decide(config, reasons, why, samples_per_ray=preset.background_samples(model))
     in_front: choices.InFront = "field" if _in_front(config, facts) else "nothing"
     model = presets.override_model(model, config.model, in_front=in_front)
     why = f"preset={config.model.preset}"

@@ -172,7 +172,7 @@ def test_the_median_finds_a_translucent_surface_in_front_of_a_wall():
 def test_a_surface_at_the_end_is_at_its_end(front, median):
     weights = front * np.eye(8)[2] + (1.0 - front) * np.eye(8)[7]
     arrays = singles(weights, np.ones((8, 3)), np.linspace(0.0, 8.0, 9))
-    seen = volume_rendering.composite(*arrays, surface_at_end=True)
+    seen = volume_rendering.composite(*arrays, last_sample="end")
     np.testing.assert_allclose(seen.mean, front * 2.5 + (1.0 - front) * 8.0, rtol=_SUMMATION)
     np.testing.assert_allclose(seen.median, median, rtol=_SUMMATION)
 
