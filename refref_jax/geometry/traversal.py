@@ -9,7 +9,8 @@ A packet uses the node table of its rays' octant. If its rays have several octan
 the tree once for each, with the other rays masked.
 
 On an accelerator, the state of a ray's loop is a row of the node table and the closest hit so far.
-Under `vmap`, `trace_ray` becomes one loop over all rays, which ends with the slowest ray.
+Under `vmap`, `trace_ray` becomes one loop over all rays, which ends with the slowest ray. Between
+two iterations the host waits for the accelerator, so each iteration visits several nodes.
 
 Source: Wald et al., Interactive Rendering with Coherent Ray Tracing (2001), for packets; Smits,
 Efficiency Issues for Ray Tracing (1998), for skip pointers.
@@ -28,7 +29,10 @@ PACKET = 16
 """Number of rays in a packet: two vectors of eight, which hide each other's latency."""
 
 _VISITS = 2
-"""Number of nodes visited in one iteration of the loop."""
+"""Number of nodes that a packet visits in one iteration of the loop."""
+
+_VISITS_OF_RAY = 8
+"""Number of nodes that a single ray visits in one iteration of the loop."""
 
 _DONE = bvh_nodes.OCTANTS
 """Octant of a ray whose traversal is complete."""
@@ -208,6 +212,15 @@ def _closer(a: Closest, b: Closest, take: Array) -> Closest:
     return Closest(*(jnp.where(take, x, y) for x, y in zip(a, b, strict=True)))
 
 
+class _Ray(NamedTuple):
+    """A single ray, prepared for box tests."""
+
+    origin: Float[Array, "3"]
+    direction: Float[Array, "3"]
+    slabs: bvh_nodes.Slabs
+    exclude_primitive: Int[Array, ""]
+
+
 class _RayWalk(NamedTuple):
     """State of a ray's traversal: the next node, and the closest hit so far."""
 
@@ -237,29 +250,46 @@ def trace_ray(
     Returns:
       The distance and index of the closest hit; the limit and `NONE` for a miss.
     """
-    slabs = bvh_nodes.slabs(origin, direction)
+    ray = _Ray(origin, direction, bvh_nodes.slabs(origin, direction), exclude_primitive)
     rows = nodes.shape[0] // bvh_nodes.OCTANTS
     root = bvh_nodes.octant(direction) * rows
     end = root + rows - 1
 
     def advance(walk: _RayWalk) -> _RayWalk:
-        node = bvh_nodes.read_node(nodes, walk.node)
-        hit = bvh_nodes.overlaps(slabs, node.entry, node.exit, walk.distance)
-        tested = hit & (node.leaf > 0)
-        distance, primitive_id = jax.lax.cond(
-            tested,
-            lambda: _test_leaf_of_ray(
-                packed, origin, direction, exclude_primitive, node.leaf - 1, walk
-            ),
-            lambda: (walk.distance, walk.primitive_id),
+        return jax.lax.fori_loop(
+            0,
+            _VISITS_OF_RAY,
+            lambda _, walk: _visit_by_ray(nodes, packed, ray, end, walk),
+            walk,
+            unroll=True,
         )
-        return _RayWalk(jnp.where(hit, walk.node + 1, node.skip), distance, primitive_id)
 
     start = _RayWalk(
         jnp.where(limit >= 0.0, root, end), limit, jnp.full_like(exclude_primitive, bvh_nodes.NONE)
     )
     walk = jax.lax.while_loop(lambda walk: walk.node < end, advance, start)
     return walk.distance, walk.primitive_id
+
+
+def _visit_by_ray(
+    nodes: Int[Array, "rows 8"],
+    packed: Float[Array, "primitives 12"],
+    ray: _Ray,
+    end: Int[Array, ""],
+    walk: _RayWalk,
+) -> _RayWalk:
+    """Visits the next node, and tests its triangles if it is a leaf; does nothing at the end."""
+    node = bvh_nodes.read_node(nodes, walk.node)
+    hit = bvh_nodes.overlaps(ray.slabs, node.entry, node.exit, walk.distance) & (walk.node < end)
+    distance, primitive_id = jax.lax.cond(
+        hit & (node.leaf > 0),
+        lambda: _test_leaf_of_ray(
+            packed, ray.origin, ray.direction, ray.exclude_primitive, node.leaf - 1, walk
+        ),
+        lambda: (walk.distance, walk.primitive_id),
+    )
+    after = jnp.where(hit, walk.node + 1, node.skip)
+    return _RayWalk(jnp.where(walk.node < end, after, walk.node), distance, primitive_id)
 
 
 def _test_leaf_of_ray(
