@@ -12,42 +12,17 @@ makes anew, together with the table `results/compiled_programs_now.csv`.
 """
 
 import json
-from pathlib import Path
 from typing import Any
 
 from absl import app, flags
 
 from benchmarks.ahead_of_time import hopper
-from benchmarks.ahead_of_time.compile import PROGRAMS, TARGETS, counts_of
+from benchmarks.ahead_of_time.compile import PROGRAMS, RECORDED, TARGETS, counts_of, excess
 
 _PROGRAMS = flags.DEFINE_list("programs", list(PROGRAMS), "Programs to compile.")
 _TARGETS = flags.DEFINE_list("targets", list(TARGETS), "Targets to compile for.")
 _PACKAGES = flags.DEFINE_list("packages", [], "Folders of packages with the plugin for CUDA 13.")
 _WRITE = flags.DEFINE_bool("write", False, "Record these counts.")
-
-RECORDED = Path(__file__).parent / "results" / "compiled_programs.json"
-"""Counts by program and target."""
-
-BOUNDED = ("kernels", "bytes", "temporaries")
-
-# Counts may grow by this much before they are refused.
-_ALLOWED = 1.02
-
-
-def excess(counted: dict[str, Any], recorded: dict[str, Any]) -> list[str]:
-    """Returns what is more than recorded, as text; and compare-and-swap, which is never allowed."""
-    found = [
-        f"{name}: {counted[name]}, recorded are {recorded[name]}"
-        for name in BOUNDED
-        if counted[name] > _ALLOWED * recorded[name]
-    ]
-    each = zip(counted["launches"], recorded["launches"], strict=True)
-    found += [
-        f"launches {depth} loops deep: {now}, recorded are {before}"
-        for depth, (now, before) in enumerate(each)
-        if depth and now > before
-    ]
-    return found + [f"instruction {name}" for name in counted["atomics"] if ".cas" in name]
 
 
 def main(arguments: list[str]) -> None:

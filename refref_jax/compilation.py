@@ -133,6 +133,11 @@ def chosen_by_platform(
     return chosen
 
 
+def runs_on_cpu() -> bool:
+    """Returns whether this process computes on CPUs, for sizes that the host chooses."""
+    return jax.default_backend() == "cpu"
+
+
 def add_missing_flag() -> None:
     """Sets the flag of XLA that a slow version needs on NVIDIA GPUs; other versions refuse it.
 

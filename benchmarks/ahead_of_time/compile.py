@@ -33,6 +33,14 @@ PROGRAMS: Mapping[str, tuple[Callable[[], Program], Callable[[Kernel], str]]] = 
 
 TARGETS = ("h100", "cpu")
 
+RECORDED = Path(__file__).parents[1] / "results" / "compiled_programs.json"
+"""Counts by program and target."""
+
+BOUNDED = ("kernels", "bytes", "temporaries")
+
+# Counts may grow by this much before they are refused.
+_ALLOWED = 1.02
+
 
 def counts_of(
     program: str, target: str, *, packages: list[str] | None = None, seconds: float = 1500.0
@@ -61,6 +69,22 @@ def counts_of(
         raise RuntimeError(f"{program} did not compile for {target}: {answer.stderr[-2000:]}")
     counted: dict[str, Any] = json.loads(answer.stdout.splitlines()[-1])
     return counted
+
+
+def excess(counted: dict[str, Any], recorded: dict[str, Any]) -> list[str]:
+    """Returns what is more than recorded, as text; and compare-and-swap, which is never allowed."""
+    found = [
+        f"{name}: {counted[name]}, recorded are {recorded[name]}"
+        for name in BOUNDED
+        if counted[name] > _ALLOWED * recorded[name]
+    ]
+    each = zip(counted["launches"], recorded["launches"], strict=True)
+    found += [
+        f"launches {depth} loops deep: {now}, recorded are {before}"
+        for depth, (now, before) in enumerate(each)
+        if depth and now > before
+    ]
+    return found + [f"instruction {name}" for name in counted["atomics"] if ".cas" in name]
 
 
 def main(program: str, target: str, dump: str) -> None:

@@ -195,4 +195,4 @@ def part_of_step(kernel: Kernel) -> str:
 
 def part_by_loops(kernel: Kernel) -> str:
     """Returns how many loops a kernel is in."""
-    return ("outside loops", "loop", "loop in a loop", "innermost loop")[len(kernel.loops)]
+    return ("outside loops", "loop", "loop in a loop", "innermost loop")[len(kernel.loops[:3])]

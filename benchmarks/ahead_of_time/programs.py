@@ -47,12 +47,12 @@ class Program(NamedTuple):
 
 def pretrace(preset: str) -> Program:
     """Returns the program that traces the light paths of many batches along the tree."""
-    return _training(preset)[0]
+    return training(preset)[0]
 
 
 def train_steps(preset: str) -> Program:
     """Returns the program that takes training steps along the tree."""
-    return _training(preset)[1]
+    return training(preset)[1]
 
 
 def backdrop_product() -> Program:
@@ -86,13 +86,13 @@ def _rays(*shape: int) -> Rays:
     return Rays(vectors, vectors, vectors[..., 0])
 
 
-def _training(preset: str) -> tuple[Program, Program]:
+def training(preset: str, multiple: int = loop.MULTIPLE) -> tuple[Program, Program]:
     asked = TrainConfig().override(scene=str(SCENE), preset=preset, paths="tree")
     (config, model, *_), scene = prepare(asked, report=lambda line: None)
     scene = jax.tree.map(lambda x: jax.ShapeDtypeStruct(np.shape(x), x.dtype), scene)
     batch = require(config.schedule.batch)
     batches = require(config.schedule.pretraced_batches)
-    capacity = capacity_for(model.settings, batch, mean=_PATHS, deviation=_DEVIATION)
+    capacity = capacity_for(model.settings, batch, mean=_PATHS, deviation=_DEVIATION, multiple=multiple)
     rays = jax.eval_shape(lambda: _rays(batches, batch))
     tracing = {
         "settings": model.settings,
