@@ -212,7 +212,7 @@ def _closer(a: Closest, b: Closest, take: Array) -> Closest:
     return Closest(*(jnp.where(take, x, y) for x, y in zip(a, b, strict=True)))
 
 
-class _Ray(NamedTuple):
+class Ray(NamedTuple):
     """A single ray, prepared for box tests."""
 
     origin: Float[Array, "3"]
@@ -221,7 +221,7 @@ class _Ray(NamedTuple):
     exclude_primitive: Int[Array, ""]
 
 
-class _RayWalk(NamedTuple):
+class RayWalk(NamedTuple):
     """State of a ray's traversal: the next node, and the closest hit so far."""
 
     node: Int[Array, ""]
@@ -250,37 +250,59 @@ def trace_ray(
     Returns:
       The distance and index of the closest hit; the limit and `NONE` for a miss.
     """
-    ray = _Ray(origin, direction, bvh_nodes.slabs(origin, direction), exclude_primitive)
+    ray, end, start = begin_ray(nodes, origin, direction, limit, exclude_primitive)
+    walk = jax.lax.while_loop(
+        lambda walk: walk.node < end,
+        lambda walk: advance_ray(nodes, packed, ray, end, walk),
+        start,
+    )
+    return walk.distance, walk.primitive_id
+
+
+def begin_ray(
+    nodes: Int[Array, "rows 8"],
+    origin: Float[Array, "3"],
+    direction: Float[Array, "3"],
+    limit: Float[Array, ""],
+    exclude_primitive: Int[Array, ""],
+) -> tuple[Ray, Int[Array, ""], RayWalk]:
+    """Returns a prepared ray, the end of its table, and the state of its loop; see `trace_ray`."""
+    ray = Ray(origin, direction, bvh_nodes.slabs(origin, direction), exclude_primitive)
     rows = nodes.shape[0] // bvh_nodes.OCTANTS
     root = bvh_nodes.octant(direction) * rows
     end = root + rows - 1
+    nothing = jnp.full_like(exclude_primitive, bvh_nodes.NONE)
+    return ray, end, RayWalk(jnp.where(limit >= 0.0, root, end), limit, nothing)
 
-    def advance(walk: _RayWalk) -> _RayWalk:
-        return jax.lax.fori_loop(
-            0,
-            _VISITS_OF_RAY,
-            lambda _, walk: _visit_by_ray(nodes, packed, ray, end, walk),
-            walk,
-            unroll=True,
-        )
 
-    start = _RayWalk(
-        jnp.where(limit >= 0.0, root, end), limit, jnp.full_like(exclude_primitive, bvh_nodes.NONE)
+def advance_ray(
+    nodes: Int[Array, "rows 8"],
+    packed: Float[Array, "primitives 12"],
+    ray: Ray,
+    end: Int[Array, ""],
+    walk: RayWalk,
+) -> RayWalk:
+    """Visits `_VISITS_OF_RAY` nodes in sequence; beyond the end of the table nothing happens."""
+    return jax.lax.fori_loop(
+        0,
+        _VISITS_OF_RAY,
+        lambda _, walk: _visit_by_ray(nodes, packed, ray, end, walk),
+        walk,
+        unroll=True,
     )
-    walk = jax.lax.while_loop(lambda walk: walk.node < end, advance, start)
-    return walk.distance, walk.primitive_id
 
 
 def _visit_by_ray(
     nodes: Int[Array, "rows 8"],
     packed: Float[Array, "primitives 12"],
-    ray: _Ray,
+    ray: Ray,
     end: Int[Array, ""],
-    walk: _RayWalk,
-) -> _RayWalk:
-    """Visits the next node, and tests its triangles if it is a leaf; does nothing at the end."""
+    walk: RayWalk,
+) -> RayWalk:
+    """Visits the next node, and tests its triangles if it is a leaf."""
     node = bvh_nodes.read_node(nodes, walk.node)
-    hit = bvh_nodes.overlaps(ray.slabs, node.entry, node.exit, walk.distance) & (walk.node < end)
+    more = walk.node < end
+    hit = bvh_nodes.overlaps(ray.slabs, node.entry, node.exit, walk.distance) & more
     distance, primitive_id = jax.lax.cond(
         hit & (node.leaf > 0),
         lambda: _test_leaf_of_ray(
@@ -289,7 +311,7 @@ def _visit_by_ray(
         lambda: (walk.distance, walk.primitive_id),
     )
     after = jnp.where(hit, walk.node + 1, node.skip)
-    return _RayWalk(jnp.where(walk.node < end, after, walk.node), distance, primitive_id)
+    return RayWalk(jnp.where(more, after, walk.node), distance, primitive_id)
 
 
 def _test_leaf_of_ray(
@@ -298,7 +320,7 @@ def _test_leaf_of_ray(
     direction: Float[Array, "3"],
     exclude_primitive: Int[Array, ""],
     first: Int[Array, ""],
-    walk: _RayWalk,
+    walk: RayWalk,
 ) -> tuple[Float[Array, ""], Int[Array, ""]]:
     """Returns the closest of the hit so far and the hits in one leaf; the lower index wins ties."""
     distance, primitive_id = walk.distance, walk.primitive_id
