@@ -88,7 +88,7 @@ def chosen_by_platform(
     default: Callable[..., Any],
     like: Callable[..., Any],
 ) -> Callable[..., Any]:
-    """Returns a function that is `cpu` where a program is compiled for CPUs, and `default` elsewhere.
+    """Returns a function that is `cpu` in programs for CPUs, and `default` in others.
 
     Like `jax.lax.platform_dependent`, it depends on what a program is lowered for, not on the
     devices of this process; but only the chosen function is traced, and only once, which matters

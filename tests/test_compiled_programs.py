@@ -24,14 +24,22 @@ def _lowered(program):
 
 
 @pytest.fixture(scope="session")
-def training():
-    """The texts of the programs that trace and step, with preset tiny."""
-    return tuple(map(_lowered, programs.training("tiny")))
+def of_tiny():
+    """The programs of preset tiny that trace and step."""
+    return programs.training("tiny")
+
+
+@pytest.fixture(scope="session")
+def training(of_tiny):
+    """Their texts, by platform."""
+    return tuple(map(_lowered, of_tiny))
 
 
 def _refused(text):
     """Returns what a program may not contain: doubles, callbacks and calls of other libraries."""
-    return set(re.findall(r"\bf64\b|\bxf64\b|custom_call|convolution|infeed|outfeed|tensor<\?", text))
+    return set(
+        re.findall(r"\bf64\b|\bxf64\b|custom_call|convolution|infeed|outfeed|tensor<\?", text)
+    )
 
 
 def _dots(text):
@@ -65,8 +73,8 @@ def test_products_of_the_solver_of_backdrops_have_all_digits(platform):
     assert [name for name, pinned in _dots(text) if pinned != 2] == []
 
 
-def test_off_cpus_all_rays_of_a_pool_are_one_block(training):
-    _, rays = programs.training("tiny")[0].arguments
+def test_off_cpus_all_rays_of_a_pool_are_one_block(of_tiny, training):
+    _, rays = of_tiny[0].arguments
     pool = f"tensor<{rays.radii.size}x3xf32>"
     loops = [line for line in training[0]["cuda"].splitlines() if "stablehlo.while" in line]
     assert any(pool in line for line in loops) and not any("<1024x3xf32>" in x for x in loops)

@@ -1,1 +1,1 @@
-"""Programs of the library, compiled for an H100 on a machine without one, and what is counted of them."""
+"""Compiles programs of the library for an H100, without one, and counts what they cost."""

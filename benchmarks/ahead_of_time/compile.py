@@ -5,7 +5,6 @@
 `counts_of` runs it in a process of its own, since XLA reads its flags once.
 """
 
-import functools
 import json
 import os
 import re
@@ -23,11 +22,11 @@ from refref_jax import compilation
 
 PROGRAMS: Mapping[str, tuple[Callable[[], Program], Callable[[Kernel], str]]] = {
     "backdrop": (programs.backdrop_product, counters.part_by_loops),
-    "tiny pretrace": (functools.partial(programs.pretrace, "tiny"), counters.part_by_loops),
-    "tiny step": (functools.partial(programs.train_steps, "tiny"), counters.part_of_step),
-    "paper pretrace": (functools.partial(programs.pretrace, "paper"), counters.part_by_loops),
-    "paper step": (functools.partial(programs.train_steps, "paper"), counters.part_of_step),
-    "best step": (functools.partial(programs.train_steps, "best"), counters.part_of_step),
+    "tiny pretrace": (lambda: programs.training("tiny")[0], counters.part_by_loops),
+    "tiny step": (lambda: programs.training("tiny")[1], counters.part_of_step),
+    "paper pretrace": (lambda: programs.training("paper")[0], counters.part_by_loops),
+    "paper step": (lambda: programs.training("paper")[1], counters.part_of_step),
+    "best step": (lambda: programs.training("best")[1], counters.part_of_step),
 }
 """Programs by name, with what divides each into parts."""
 

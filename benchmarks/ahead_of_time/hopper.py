@@ -1,4 +1,4 @@
-"""An H100 as a target of XLA's compiler, which needs no GPU: two packages and ptxas of CUDA suffice.
+"""An H100 as a target of XLA's compiler: two packages and ptxas of CUDA suffice, without a GPU.
 
 A process compiles for one target with the environment that `environment` returns. No kernel is
 tuned, as that needs a GPU: tiles of matrix products, and what is padded for them, are defaults.
@@ -81,9 +81,7 @@ def environment(
 
 @functools.cache  # Arrays of two topologies would be on different devices.
 def _sharding() -> jax.sharding.SingleDeviceSharding:
-    topology = topologies.get_topology_desc(
-        platform="cuda", target_config=TARGET, topology="1x1x1"
-    )
+    topology = topologies.get_topology_desc(platform="cuda", target_config=TARGET, topology="1x1x1")
     return jax.sharding.SingleDeviceSharding(topology.devices[0])
 
 

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from refref_jax.geometry.rays import Rays
-from refref_jax.optics.path_settings import STRAIGHT, capacity_for
+from refref_jax.optics.light_paths import straight_ends
+from refref_jax.optics.path_settings import capacity_for
 from refref_jax.render import backdrop
 from refref_jax.render.model import path_detail
 from refref_jax.sampling.scene_bounds import Domain
@@ -45,54 +46,21 @@ class Program(NamedTuple):
         return self.function.trace(*place(self.arguments), **self.options)
 
 
-def pretrace(preset: str) -> Program:
-    """Returns the program that traces the light paths of many batches along the tree."""
-    return training(preset)[0]
-
-
-def train_steps(preset: str) -> Program:
-    """Returns the program that takes training steps along the tree."""
-    return training(preset)[1]
-
-
-def backdrop_product() -> Program:
-    """Returns the product that the backdrop's solver forms in each iteration, and its transpose."""
-    domain = Domain(1.0, "unbounded")
-    rays = jax.eval_shape(lambda: _rays(_PIXELS))
-    shape = jax.ShapeDtypeStruct
-    ends = jax.eval_shape(lambda rays: _straight_lookups(rays, domain), rays)
-    colours, numbers = shape((_PIXELS, 3), jnp.float32), shape((_PIXELS,), jnp.float32)
-    views = shape((_PIXELS,), jnp.int32)
-    block = Block(ends, shape((_PIXELS, 0), jnp.float32), colours, colours, numbers, views)
-    levels = jax.eval_shape(lambda: backdrop.init(_RESOLUTION, radiance=jnp.zeros(3)))
-    return Program(jax.jit(_product), (levels, block), {})
-
-
-def _product(levels: backdrop.Pyramid, block: Block) -> backdrop.Pyramid:
-    seen = backdrop_equations._predict(backdrop_equations.mipmap(levels, "unbounded"), block)
-    spread = backdrop_equations._transposed(seen, block, resolution=_RESOLUTION)
-    return backdrop_equations._mipmap_transposed(spread, "unbounded")
-
-
-def _straight_lookups(rays: Rays, domain: Domain) -> backdrop.Lookups:
-    from refref_jax.optics.light_paths import straight_ends
-
-    ends = straight_ends(rays, footprint="differential")
-    return backdrop.locate(domain, ends, ends.rays, resolution=_RESOLUTION, most_taps=3, axes=0)
-
-
-def _rays(*shape: int) -> Rays:
-    vectors = jnp.zeros((*shape, 3), jnp.float32)
-    return Rays(vectors, vectors, vectors[..., 0])
-
-
 def training(preset: str, multiple: int = loop.MULTIPLE) -> tuple[Program, Program]:
+    """Returns the programs that trace light paths along the tree, and that take training steps.
+
+    Args:
+      preset: name of a preset.
+      multiple: number that divides the capacity for paths; by default as on accelerators.
+    """
     asked = TrainConfig().override(scene=str(SCENE), preset=preset, paths="tree")
     (config, model, *_), scene = prepare(asked, report=lambda line: None)
     scene = jax.tree.map(lambda x: jax.ShapeDtypeStruct(np.shape(x), x.dtype), scene)
     batch = require(config.schedule.batch)
     batches = require(config.schedule.pretraced_batches)
-    capacity = capacity_for(model.settings, batch, mean=_PATHS, deviation=_DEVIATION, multiple=multiple)
+    capacity = capacity_for(
+        model.settings, batch, mean=_PATHS, deviation=_DEVIATION, multiple=multiple
+    )
     rays = jax.eval_shape(lambda: _rays(batches, batch))
     tracing = {
         "settings": model.settings,
@@ -115,3 +83,32 @@ def training(preset: str, multiple: int = loop.MULTIPLE) -> tuple[Program, Progr
             {"config": config, "model": model.config},
         ),
     )
+
+
+def backdrop_product() -> Program:
+    """Returns the product that the backdrop's solver forms in each iteration, and its transpose."""
+    domain = Domain(1.0, "unbounded")
+    rays = jax.eval_shape(lambda: _rays(_PIXELS))
+    shape = jax.ShapeDtypeStruct
+    ends = jax.eval_shape(lambda rays: _straight_lookups(rays, domain), rays)
+    colours, numbers = shape((_PIXELS, 3), jnp.float32), shape((_PIXELS,), jnp.float32)
+    views = shape((_PIXELS,), jnp.int32)
+    block = Block(ends, shape((_PIXELS, 0), jnp.float32), colours, colours, numbers, views)
+    levels = jax.eval_shape(lambda: backdrop.init(_RESOLUTION, radiance=jnp.zeros(3)))
+    return Program(jax.jit(_product), (levels, block), {})
+
+
+def _product(levels: backdrop.Pyramid, block: Block) -> backdrop.Pyramid:
+    seen = backdrop_equations._predict(backdrop_equations.mipmap(levels, "unbounded"), block)
+    spread = backdrop_equations._transposed(seen, block, resolution=_RESOLUTION)
+    return backdrop_equations._mipmap_transposed(spread, "unbounded")
+
+
+def _straight_lookups(rays: Rays, domain: Domain) -> backdrop.Lookups:
+    ends = straight_ends(rays, footprint="differential")
+    return backdrop.locate(domain, ends, ends.rays, resolution=_RESOLUTION, most_taps=3, axes=0)
+
+
+def _rays(*shape: int) -> Rays:
+    vectors = jnp.zeros((*shape, 3), jnp.float32)
+    return Rays(vectors, vectors, vectors[..., 0])

@@ -256,9 +256,9 @@ def capacity_for(
 ) -> int:
     """Returns the capacity for the paths of a batch of a scene.
 
-    This is the mean number of paths of a random batch plus one standard deviation, rounded up to a
-    multiple of a power of two. One batch in six drops its weakest paths, and training logs their throughput. The
-    cost of a step is proportional to this capacity; a capacity for all paths would cost 6 % more.
+    This is the mean number of paths of a random batch plus one standard deviation, rounded up. One
+    batch in six drops its weakest paths, and training logs their throughput. The cost of a step is
+    proportional to this capacity; a capacity for all paths would cost 6 % more.
 
     Args:
       settings: path settings.
