@@ -8,7 +8,7 @@ backdrops) for an H100 and for this CPU, each in a process of its own, and print
 temporaries by part. Counts are those of `ahead_of_time.counters`; nothing runs. A step is one
 iteration of its program. Asserted is that no kernel compares and swaps, and that kernels, bytes,
 temporaries and launches are at most 2 % above `results/compiled_programs.json`, which `--write`
-makes anew.
+writes.
 """
 
 import json

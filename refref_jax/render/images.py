@@ -115,6 +115,11 @@ def size_for(rays: int, *, most: int) -> int:
     return min(most, max(_SMALLEST_TILE, 1 << max(rays - 1, 0).bit_length()))
 
 
+def tile_for(rays: int) -> int:
+    """Returns the number of rays to trace at once on this process's devices."""
+    return size_for(rays, most=on_this_device(TILE))
+
+
 def join(parts: Sequence[_Tree]) -> _Tree:
     """Concatenates the arrays of several pytrees, as NumPy arrays."""
     return jax.tree.map(lambda *each: np.concatenate(each), *parts)
@@ -247,7 +252,7 @@ def render_image(
     return in_tiles(
         lambda tile, _, real: _render_tile(model, tile, real, chunk, branch),
         rays,
-        tile=size_for(max(rays.radii.size, TILE), most=on_this_device(TILE)),
+        tile=tile_for(max(rays.radii.size, TILE)),
         nothing=nothing,
         instead=_INSTEAD,
     )

@@ -177,8 +177,7 @@ def read(
     scene = jax.device_put(scene)
     rays_per_view = photographs.shape[1] * photographs.shape[2] * side**2
     group, done = max(1, images.RAYS_OF_A_BAND // rays_per_view), itertools.count(1)
-    most = images.on_this_device(images.TILE)
-    tile = images.size_for(min(group, len(photographs)) * rays_per_view, most=most)
+    tile = images.tile_for(min(group, len(photographs)) * rays_per_view)
 
     look = functools.partial(
         _look,
