@@ -10,7 +10,6 @@ one. Asserted is that `compilation` knows which versions need the flag. ptxas, a
 needed.
 """
 
-import os
 import re
 import subprocess
 import sys
@@ -19,37 +18,17 @@ from pathlib import Path
 
 from absl import app, flags
 
+from benchmarks.ahead_of_time import hopper
 from refref_jax.compilation import ATOMICS_FLAG, SLOW_ATOMICS
 
 _PACKAGES = flags.DEFINE_list("packages", [], "Folders of packages with the plugin for CUDA 13.")
-_CUDA = flags.DEFINE_string("cuda", "/usr/local/cuda", "Folder of CUDA.")
-
-_H100 = """
-gpu_device_info {
-  threads_per_block_limit: 1024 threads_per_warp: 32 threads_per_core_limit: 2048
-  shared_memory_per_block: 49152 shared_memory_per_core: 233472
-  shared_memory_per_block_optin: 232448 core_count: 132 fpus_per_core: 128
-  block_dim_limit_x: 2147483647 block_dim_limit_y: 65535 block_dim_limit_z: 65535
-  memory_bandwidth: 3352320000000 l2_cache_size: 52428800 clock_rate_ghz: 1.98
-  device_memory_size: 84929347584 cuda_compute_capability { major: 9 }
-  registers_per_core_limit: 65536 registers_per_block_limit: 65536
-}
-platform_name: "CUDA"
-dnn_version_info { major: 9 minor: 12 }
-runtime_version { major: 13 }
-device_description_str: "NVIDIA H100 80GB HBM3"
-"""
+_CUDA = flags.DEFINE_string("cuda", "", "Folder of CUDA; by default that of ptxas.")
 
 _COMPILE = """
-import sys
 import jax, jaxlib, jax.numpy as jnp
-from jax.experimental import topologies
+from benchmarks.ahead_of_time.hopper import placed
 
-topology = topologies.get_topology_desc(
-    platform="cuda", target_config=sys.argv[1], topology="1x1x1"
-)
-where = jax.sharding.SingleDeviceSharding(topology.devices[0])
-shape = lambda *size, of: jax.ShapeDtypeStruct(size, of, sharding=where)
+shape = lambda *size, of: placed(jax.ShapeDtypeStruct(size, of))
 add = jax.jit(lambda table, at, values: table.at[at].add(values))
 for width in (1, 2, 4):
     table, values = shape(4913, width, of=jnp.float32), shape(100_000, width, of=jnp.float32)
@@ -79,17 +58,10 @@ def main(arguments: list[str]) -> None:
 def _compiled(folder: str, flag: str) -> tuple[str, str]:
     """Compiles in a process of its own, and returns the version and the atomic instructions."""
     with tempfile.TemporaryDirectory() as dump:
-        words = ["--xla_gpu_autotune_level=0", f"--xla_gpu_cuda_data_dir={_CUDA.value}"]
-        words += [f"--xla_dump_to={dump}", flag]
-        settings = {
-            "JAX_PLATFORMS": "cpu",
-            "JAX_SKIP_CUDA_CONSTRAINTS_CHECK": "1",
-            "PYTHONPATH": folder,
-            "XLA_FLAGS": " ".join(words).strip(),
-        }
         answer = subprocess.run(
-            [sys.executable, "-c", _COMPILE, _H100],
-            env=os.environ | settings,
+            [sys.executable, "-c", _COMPILE],
+            env=hopper.environment(dump=dump, flags=[flag], folder=_CUDA.value, packages=[folder]),
+            cwd=Path(__file__).parents[1],
             capture_output=True,
             text=True,
         )

@@ -1,9 +1,11 @@
-"""Settings of compilation: native loops, a flag for versions slow on GPUs, who traces rays.
+"""Settings of compilation: native loops, functions by platform, slow versions, the traversal.
 
 XLA:CPU runs a `while_loop` as many small kernels, dispatched one by one. A call with the attribute
 set by `native_loop` is instead emitted as one function with real control flow, which makes BVH
 traversal about five times faster. The attribute is internal to XLA: versions that do not know it
 ignore it, and only the speed changes.
+
+`chosen_by_platform` makes one function of two, for CPUs and for other devices.
 
 Some versions compile scatter-adds of single floats for NVIDIA GPUs as loops that compare and swap,
 hundreds of times slower than an addition in memory. `add_missing_flag` sets the flag that they
@@ -13,6 +15,7 @@ The environment variable `REFREF_TRAVERSAL` chooses how closest hits are found. 
 compiled already keep what they were compiled with.
 """
 
+import functools
 import importlib.metadata
 import os
 import warnings
@@ -22,6 +25,8 @@ from typing import Any, Literal, ParamSpec, TypeVar
 import jax
 from jax._src import xla_bridge
 from jax.experimental.xla_metadata import set_xla_metadata
+from jax.extend.core import Primitive
+from jax.interpreters import batching, mlir
 from jaxtyping import Array
 
 SLOW_ATOMICS = ("0.10.2", "0.11.0")
@@ -93,6 +98,63 @@ def is_flag_missing() -> bool:
     flags = os.environ.get("XLA_FLAGS", "")
     slow = _version("jaxlib") in SLOW_ATOMICS and any(_version(each) for each in _PLUGINS)
     return slow and not any(each in flags for each in _ENOUGH)
+
+
+def chosen_by_platform(
+    name: str,
+    *,
+    cpu: Callable[..., Any],
+    default: Callable[..., Any],
+    like: Callable[..., Any],
+) -> Callable[..., Any]:
+    """Returns a function that is `cpu` in programs for CPUs, and `default` in others.
+
+    Like `jax.lax.platform_dependent`, it depends on what a program is lowered for, not on the
+    devices of this process; but only the chosen function is traced, and only once, which matters
+    for large ones. It has no derivative; mapped over an axis, it is `cpu` on all platforms.
+
+    Args:
+      name: name of the operation in printed programs.
+      cpu: function of pytrees of arrays, with keyword arguments that can be hashed.
+      default: function of the same arguments.
+      like: function of the same arguments that returns arrays of the same shapes as both.
+    """
+    primitive = Primitive(name)
+    primitive.multiple_results = True
+
+    def flat(function: Callable[..., Any]) -> Callable[..., list[Array]]:
+        def of_leaves(*leaves: Array, tree: Any, options: tuple[tuple[str, Any], ...]) -> Any:
+            return jax.tree.leaves(function(*jax.tree.unflatten(tree, leaves), **dict(options)))
+
+        return of_leaves
+
+    def shapes(*leaves: Any, **static: Any) -> list[jax.core.ShapedArray]:
+        found = jax.eval_shape(functools.partial(flat(like), **static), *leaves)
+        return [jax.core.ShapedArray(x.shape, x.dtype) for x in found]
+
+    def mapped(leaves: Any, axes: Any, **static: Any) -> tuple[list[Array], list[int]]:
+        found = jax.vmap(functools.partial(flat(cpu), **static), in_axes=tuple(axes))(*leaves)
+        return found, [0] * len(found)
+
+    bind = jax.jit(primitive.bind, static_argnames=("tree", "options"))
+    primitive.def_impl(bind)
+    primitive.def_abstract_eval(shapes)
+    batching.primitive_batchers[primitive] = mapped
+    mlir.register_lowering(primitive, mlir.lower_fun(flat(default), multiple_results=True))
+    mlir.register_lowering(primitive, mlir.lower_fun(flat(cpu), multiple_results=True), "cpu")
+
+    def chosen(*arguments: Any, **options: Any) -> Any:
+        leaves, tree = jax.tree.flatten(arguments)
+        result = jax.tree.structure(jax.eval_shape(functools.partial(like, **options), *arguments))
+        static = {"tree": tree, "options": tuple(sorted(options.items()))}
+        return jax.tree.unflatten(result, primitive.bind(*leaves, **static))
+
+    return chosen
+
+
+def runs_on_cpu() -> bool:
+    """Returns whether this process computes on CPUs, for sizes that the host chooses."""
+    return jax.default_backend() == "cpu"
 
 
 def add_missing_flag() -> None:

@@ -1,4 +1,7 @@
-"""The flag for slow versions of XLA, and the choice of traversal; loops are tested where used."""
+"""The flag for slow versions of XLA, functions chosen by platform, and the choice of traversal.
+
+Loops are tested where they are used.
+"""
 
 import importlib.metadata
 import os
@@ -6,6 +9,9 @@ import subprocess
 import sys
 import warnings
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from refref_jax import compilation
@@ -120,3 +126,38 @@ def test_a_traversal_that_cannot_be_had_is_an_error(
         installed["warp-lang"] = version
     with pytest.raises(ValueError, match=message):
         compilation.chosen_traversal()
+
+
+def _by_platform(traced):
+    def tripled(pair, *, offset):
+        traced.append("cpu")
+        return {"sum": 3.0 * pair[0] + pair[1], "same": pair[1] + offset}
+
+    def halved(pair, *, offset):
+        traced.append("other")
+        return {"sum": jnp.sin(pair[0]) + pair[1], "same": pair[1] - offset}
+
+    def like(pair, *, offset):
+        return {"sum": pair[0] + pair[1], "same": pair[1]}
+
+    return compilation.chosen_by_platform("tripled", cpu=tripled, default=halved, like=like)
+
+
+def test_the_function_for_cpus_is_used_on_a_cpu_eagerly_compiled_and_mapped():
+    chosen, pair = _by_platform([]), (jnp.arange(4.0), jnp.ones(4))
+    expected = {"sum": 3.0 * np.arange(4.0) + 1.0, "same": np.full(4, 3.0)}
+    for function in (chosen, jax.jit(chosen, static_argnames="offset")):
+        jax.tree.map(np.testing.assert_array_equal, function(pair, offset=2.0), expected)
+    mapped = jax.vmap(lambda x: chosen((x, jnp.ones(())), offset=2.0))(pair[0])
+    jax.tree.map(np.testing.assert_array_equal, mapped, expected)
+
+
+@pytest.mark.parametrize(
+    ("platform", "name"), [("cpu", "cpu"), ("cuda", "other"), ("tpu", "other")]
+)
+def test_only_the_function_for_the_platform_is_traced_and_once(platform, name):
+    traced = []
+    chosen, pair = _by_platform(traced), (jnp.arange(4.0), jnp.ones(4))
+    program = jax.jit(lambda pair: chosen(pair, offset=1.0)).trace(pair)
+    text = program.lower(lowering_platforms=(platform,)).as_text()
+    assert traced == [name] and ("sine" in text) == (name == "other")

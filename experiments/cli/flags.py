@@ -138,10 +138,10 @@ def rays_per_pixel(default: int) -> flags.FlagHolder[int]:
     return holder
 
 
-def chunk() -> flags.FlagHolder[int]:
+def chunk() -> flags.FlagHolder[int | None]:
     """Defines `--chunk`."""
-    what = "Paths traced at once. Reduce it if memory runs out."
-    return flags.DEFINE_integer("chunk", 4096, what, 1)
+    what = "Paths rendered at once; by default 4096, and 65,536 on accelerators. Reduce it if "
+    return flags.DEFINE_integer("chunk", None, what + "memory runs out.", 1)
 
 
 def lpips_weights() -> flags.FlagHolder[str | None]:

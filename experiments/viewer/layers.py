@@ -75,7 +75,7 @@ def offered(model: Model, *, truth: bool) -> tuple[str, ...]:
 
 
 def draw(
-    model: Model, layer: str, rays: Rays, *, chunk: int, most: int, cancelled: Cancelled
+    model: Model, layer: str, rays: Rays, *, chunk: int | None, most: int, cancelled: Cancelled
 ) -> Image | None:
     """Draws a layer other than `error`.
 
@@ -107,7 +107,7 @@ def draw(
 
 
 def draw_error(
-    model: Model, pixels: Pixels, *, chunk: int, cancelled: Cancelled
+    model: Model, pixels: Pixels, *, chunk: int | None, cancelled: Cancelled
 ) -> tuple[Image, float] | None:
     """Draws the amplified error of a test view.
 
@@ -178,6 +178,6 @@ def _draw_surface(model: Model, layer: str, rays: Rays, most: int) -> Image:
 def _bands(rays: Rays) -> Iterator[Rays]:
     """Yields bands of rows, as many as are traced at once, but at least one row each."""
     height, width = rays.radii.shape
-    rows = max(1, images.TILE // width)
+    rows = max(1, images.on_this_device(images.TILE) // width)
     for start in range(0, height, rows):
         yield jax.tree.map(lambda x, start=start: x[start : start + rows], rays)

@@ -57,7 +57,7 @@ class Subject:
     frames: Frames | None
     parts: tuple[str, ...]
     heights: tuple[int, ...]
-    chunk: int
+    chunk: int | None
 
     @functools.cached_property
     def layers(self) -> tuple[str, ...]:

@@ -181,9 +181,9 @@ def _gathered(
     precision: Precision,
 ) -> Float[Array, "*batch features"]:
     entries, weights = _stacked_corners(positions, resolution, table.shape[0])
-    stored = table.astype(jnp.bfloat16) if precision == "bfloat16" else table
-    rows = stored.at[entries].get(mode="promise_in_bounds").astype(table.dtype)
-    return jnp.einsum("...c,...cf->...f", weights, rows)
+    # Converting the table would read and write all of it.
+    rows = _rounded(table.at[entries].get(mode="promise_in_bounds"), precision)
+    return jnp.einsum("...c,...cf->...f", weights, rows, precision=jax.lax.Precision.HIGHEST)
 
 
 def _scattered(
@@ -194,6 +194,9 @@ def _scattered(
     entries: int,
 ) -> Float[Array, "entries features"]:
     """Adds each point's gradient to the rows that it reads, multiplied by their weights."""
+    # Without the barrier, XLA stores rows and weights of `_gathered` for all points and levels:
+    # several times the traffic of computing them again.
+    positions = jax.lax.optimization_barrier(positions)
     rows, weights = _stacked_corners(positions, resolution, entries)
     shares = weights[..., None] * slopes[..., None, :]
     zeros = jnp.zeros((entries, slopes.shape[-1]), slopes.dtype)

@@ -11,7 +11,8 @@ A packet uses the node table of its rays' octant. If its rays have several octan
 the tree once for each, with the other rays masked.
 
 On an accelerator, the state of a ray's loop is a row of the node table and the closest hit so far.
-Under `vmap`, `trace_ray` becomes one loop over all rays, which ends with the slowest ray.
+Under `vmap`, `trace_ray` becomes one loop over all rays, which ends with the slowest ray. Between
+two iterations the host waits for the accelerator, so each iteration visits several nodes.
 
 The kernel (`trace_in_warp`) is `trace_ray` again, over the same tables and with the same rules of
 edges, ties and of the triangle that a ray leaves: a change of one is a change of both. It is
@@ -36,7 +37,10 @@ PACKET = 16
 """Number of rays in a packet: two vectors of eight, which hide each other's latency."""
 
 _VISITS = 2
-"""Number of nodes visited in one iteration of the loop."""
+"""Number of nodes that a packet visits in one iteration of the loop."""
+
+_VISITS_OF_RAY = 8
+"""Number of nodes that a single ray visits in one iteration of the loop."""
 
 # Options with which Warp compiles operations as they are written.
 _WARP_OPTIONS = {"enable_backward": False, "fuse_fp": False, "fast_math": False}
@@ -219,7 +223,16 @@ def _closer(a: Closest, b: Closest, take: Array) -> Closest:
     return Closest(*(jnp.where(take, x, y) for x, y in zip(a, b, strict=True)))
 
 
-class _RayWalk(NamedTuple):
+class Ray(NamedTuple):
+    """A single ray, prepared for box tests."""
+
+    origin: Float[Array, "3"]
+    direction: Float[Array, "3"]
+    slabs: bvh_nodes.Slabs
+    exclude_primitive: Int[Array, ""]
+
+
+class RayWalk(NamedTuple):
     """State of a ray's traversal: the next node, and the closest hit so far."""
 
     node: Int[Array, ""]
@@ -248,29 +261,68 @@ def trace_ray(
     Returns:
       The distance and index of the closest hit; the limit and `NONE` for a miss.
     """
-    slabs = bvh_nodes.slabs(origin, direction)
+    ray, end, start = begin_ray(nodes, origin, direction, limit, exclude_primitive)
+    walk = jax.lax.while_loop(
+        lambda walk: walk.node < end,
+        lambda walk: advance_ray(nodes, packed, ray, end, walk),
+        start,
+    )
+    return walk.distance, walk.primitive_id
+
+
+def begin_ray(
+    nodes: Int[Array, "rows 8"],
+    origin: Float[Array, "3"],
+    direction: Float[Array, "3"],
+    limit: Float[Array, ""],
+    exclude_primitive: Int[Array, ""],
+) -> tuple[Ray, Int[Array, ""], RayWalk]:
+    """Returns a prepared ray, the end of its table, and the state of its loop; see `trace_ray`."""
+    ray = Ray(origin, direction, bvh_nodes.slabs(origin, direction), exclude_primitive)
     rows = nodes.shape[0] // bvh_nodes.OCTANTS
     root = bvh_nodes.octant(direction) * rows
     end = root + rows - 1
+    nothing = jnp.full_like(exclude_primitive, bvh_nodes.NONE)
+    return ray, end, RayWalk(jnp.where(limit >= 0.0, root, end), limit, nothing)
 
-    def advance(walk: _RayWalk) -> _RayWalk:
-        node = bvh_nodes.read_node(nodes, walk.node)
-        hit = bvh_nodes.overlaps(slabs, node.entry, node.exit, walk.distance)
-        tested = hit & (node.leaf > 0)
-        distance, primitive_id = jax.lax.cond(
-            tested,
-            lambda: _test_leaf_of_ray(
-                packed, origin, direction, exclude_primitive, node.leaf - 1, walk
-            ),
-            lambda: (walk.distance, walk.primitive_id),
-        )
-        return _RayWalk(jnp.where(hit, walk.node + 1, node.skip), distance, primitive_id)
 
-    start = _RayWalk(
-        jnp.where(limit >= 0.0, root, end), limit, jnp.full_like(exclude_primitive, bvh_nodes.NONE)
+def advance_ray(
+    nodes: Int[Array, "rows 8"],
+    packed: Float[Array, "primitives 12"],
+    ray: Ray,
+    end: Int[Array, ""],
+    walk: RayWalk,
+) -> RayWalk:
+    """Visits `_VISITS_OF_RAY` nodes in sequence; beyond the end of the table nothing happens."""
+    return jax.lax.fori_loop(
+        0,
+        _VISITS_OF_RAY,
+        lambda _, walk: _visit_by_ray(nodes, packed, ray, end, walk),
+        walk,
+        unroll=True,
     )
-    walk = jax.lax.while_loop(lambda walk: walk.node < end, advance, start)
-    return walk.distance, walk.primitive_id
+
+
+def _visit_by_ray(
+    nodes: Int[Array, "rows 8"],
+    packed: Float[Array, "primitives 12"],
+    ray: Ray,
+    end: Int[Array, ""],
+    walk: RayWalk,
+) -> RayWalk:
+    """Visits the next node, and tests its triangles if it is a leaf."""
+    node = bvh_nodes.read_node(nodes, walk.node)
+    more = walk.node < end
+    hit = bvh_nodes.overlaps(ray.slabs, node.entry, node.exit, walk.distance) & more
+    distance, primitive_id = jax.lax.cond(
+        hit & (node.leaf > 0),
+        lambda: _test_leaf_of_ray(
+            packed, ray.origin, ray.direction, ray.exclude_primitive, node.leaf - 1, walk
+        ),
+        lambda: (walk.distance, walk.primitive_id),
+    )
+    after = jnp.where(hit, walk.node + 1, node.skip)
+    return RayWalk(jnp.where(more, after, walk.node), distance, primitive_id)
 
 
 def _test_leaf_of_ray(
@@ -279,7 +331,7 @@ def _test_leaf_of_ray(
     direction: Float[Array, "3"],
     exclude_primitive: Int[Array, ""],
     first: Int[Array, ""],
-    walk: _RayWalk,
+    walk: RayWalk,
 ) -> tuple[Float[Array, ""], Int[Array, ""]]:
     """Returns the closest of the hit so far and the hits in one leaf; the lower index wins ties."""
     distance, primitive_id = walk.distance, walk.primitive_id

@@ -78,7 +78,7 @@ def facet_normal(
     """
     tangent, bitangent = orthonormal_basis(normal)
     frame = jnp.stack([tangent, bitangent, normal])
-    towards = -(frame @ direction)
+    towards = -numerics.product(frame, direction)
     # The ray as seen by a hemisphere that is stretched to alpha = 1.
     stretched = numerics.normalize(towards * jnp.stack([alpha, alpha, jnp.ones_like(alpha)]))
     across, along = _disc_axes(stretched)
@@ -89,7 +89,7 @@ def facet_normal(
     up = numerics.safe_sqrt(1.0 - jnp.square(u) - jnp.square(v))
     facet = u * across + v * along + up * stretched
     facet = jnp.stack([alpha * facet[0], alpha * facet[1], jnp.maximum(facet[2], 0.0)])
-    return jnp.where(alpha > 0.0, numerics.normalize(facet @ frame), normal)
+    return jnp.where(alpha > 0.0, numerics.normalize(numerics.product(facet, frame)), normal)
 
 
 def tilted(facet: Float[Array, "3"], tilt: Float[Array, "2"]) -> Float[Array, "3"]:
@@ -99,7 +99,7 @@ def tilted(facet: Float[Array, "3"], tilt: Float[Array, "2"]) -> Float[Array, "3
       facet: unit normal of the facet.
       tilt: slope along two directions in the facet.
     """
-    return numerics.normalize(facet + tilt @ jnp.stack(orthonormal_basis(facet)))
+    return numerics.normalize(facet + numerics.product(tilt, jnp.stack(orthonormal_basis(facet))))
 
 
 def spacing(alpha: Float[Array, ""], stratum: Stratum) -> Float[Array, "2 2"]:

@@ -251,19 +251,23 @@ def capacities(settings: PathSettings, rays: int) -> Capacities:
     )
 
 
-def capacity_for(settings: PathSettings, rays: int, *, mean: float, deviation: float) -> int:
+def capacity_for(
+    settings: PathSettings, rays: int, *, mean: float, deviation: float, multiple: int = 8
+) -> int:
     """Returns the capacity for the paths of a batch of a scene.
 
-    This is the mean number of paths of a random batch plus one standard deviation, rounded up to a
-    multiple of 8. One batch in six drops its weakest paths, and training logs their throughput. The
-    cost of a step is proportional to this capacity; a capacity for all paths would cost 6 % more.
+    This is the mean number of paths of a random batch plus one standard deviation, rounded up. One
+    batch in six drops its weakest paths, and training logs their throughput. The cost of a step is
+    proportional to this capacity; a capacity for all paths would cost 6 % more.
 
     Args:
       settings: path settings.
       rays: number of rays in a batch.
       mean: mean number of paths per camera ray of the scene.
       deviation: standard deviation of the number of paths over rays.
+      multiple: number that divides the capacity, unless all paths are fewer. With 128, matrix
+        products of NVIDIA GPUs need no padding, which would copy all factors.
     """
     most = capacities(settings, rays).paths
     needed = rays * mean + math.sqrt(rays) * deviation
-    return max(rays, min(most, 8 * math.ceil(needed / 8)))
+    return max(rays, min(most, multiple * math.ceil(needed / multiple)))

@@ -291,7 +291,8 @@ def _strongest_of_each(
     def choose(batch: Int[Array, " paths"]) -> Bool[Array, " paths"]:
         order = jnp.lexsort((-throughput, batch))
         rank = _rank_in_group(batch[order], batches)
-        return jnp.zeros_like(batch, bool).at[order].set(rank < capacity)
+        # Writing Booleans would compare and swap on an NVIDIA GPU.
+        return jnp.zeros_like(batch).at[order].set(rank) < capacity
 
     real = batch < batches
     counts = jax.ops.segment_sum(jnp.ones_like(batch), batch, num_segments=batches + 1)

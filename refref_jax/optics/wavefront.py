@@ -25,6 +25,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax.choices import Footprint
+from refref_jax.compilation import chosen_by_platform
 from refref_jax.geometry import bvh
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import media, path_settings, path_step, path_tree, queues, ray_differentials
@@ -35,9 +36,9 @@ from refref_jax.optics.path_tree import NO_SEGMENT, Ends, PathTree, Segments
 from refref_jax.optics.queues import Queue
 from refref_jax.optics.scene import Scene
 
-# Number of rays cast per iteration: a core's cache holds so many, with their children. Accelerators
-# benefit from more.
-_BLOCK_ON_CPU, _BLOCK = 1024, 4096
+# Number of rays cast per iteration: a core's cache holds so many, with their children. On an
+# accelerator a block of many rays costs as much as one of few, so all rays are one block.
+_BLOCK_ON_CPU, _BLOCK = 1024, 1 << 20
 
 # From this number of blocks, the last rays are cast in smaller blocks, by a second compiled loop.
 _MANY_BLOCKS = 6
@@ -216,8 +217,6 @@ def follow(
       footprint: `differential` carries derivatives across the pixel.
       block: number of rays cast per iteration; by default what suits the platform.
     """
-    if block is None:
-        block = _BLOCK_ON_CPU if jax.default_backend() == "cpu" else _BLOCK
     return _follow(settings, footprint, block, scene, rays, interior_list)
 
 
@@ -225,10 +224,23 @@ def follow(
 def _follow(
     settings: PathSettings,
     footprint: Footprint,
-    block: int,
+    block: int | None,
     scene: Scene,
     rays: Rays,
     interior_list: Int[Array, "rays slots"],
+) -> PathTree:
+    if block is not None:
+        return _in_blocks(scene, rays, interior_list, settings, footprint, block)
+    return _as_platform_likes(scene, rays, interior_list, settings=settings, footprint=footprint)
+
+
+def _in_blocks(
+    scene: Scene,
+    rays: Rays,
+    interior_list: Int[Array, "rays slots"],
+    settings: PathSettings,
+    footprint: Footprint,
+    block: int,
 ) -> PathTree:
     count = rays.radii.shape[0]
     block = max(1, min(block, count))
@@ -244,6 +256,51 @@ def _follow(
     small = block // _SMALLER
     walk = _Walk(*queues.pop(stack, small), walk.tree)
     return _trace_remaining(scene, walk, settings, small, capacities, least=1).tree
+
+
+def _in_cached_blocks(
+    scene: Scene,
+    rays: Rays,
+    interior_list: Int[Array, "rays slots"],
+    *,
+    settings: PathSettings,
+    footprint: Footprint,
+) -> PathTree:
+    return _in_blocks(scene, rays, interior_list, settings, footprint, _BLOCK_ON_CPU)
+
+
+def _at_once(
+    scene: Scene,
+    rays: Rays,
+    interior_list: Int[Array, "rays slots"],
+    *,
+    settings: PathSettings,
+    footprint: Footprint,
+) -> PathTree:
+    """Traces all rays as one block, with lists as long as those of `_in_cached_blocks`."""
+    tree = _in_blocks(scene, rays, interior_list, settings, footprint, _BLOCK)
+    like = _empty(scene, rays, interior_list, settings=settings, footprint=footprint)
+    return jax.tree.map(lambda x, y: x[: y.shape[0]] if y.ndim else x, tree, like)
+
+
+def _empty(
+    scene: Scene,
+    rays: Rays,
+    interior_list: Int[Array, "rays slots"],
+    *,
+    settings: PathSettings,
+    footprint: Footprint,
+) -> PathTree:
+    """Returns the path tree of `_in_cached_blocks` before any ray is cast."""
+    count = rays.radii.shape[0]
+    block = max(1, min(_BLOCK_ON_CPU, count))
+    capacities = path_settings.capacities(settings, count)
+    return _begin(scene, rays, interior_list, footprint, block, capacities).tree
+
+
+_as_platform_likes = chosen_by_platform(
+    "follow_light_paths", cpu=_in_cached_blocks, default=_at_once, like=_empty
+)
 
 
 def _trace_remaining(
@@ -278,7 +335,11 @@ def _trace_remaining(
 
 @_follow.defjvp
 def _refuse_gradients(
-    settings: PathSettings, footprint: Footprint, block: int, primals: object, tangents: object
+    settings: PathSettings,
+    footprint: Footprint,
+    block: int | None,
+    primals: object,
+    tangents: object,
 ) -> NoReturn:
     del settings, footprint, block, primals, tangents
     raise TypeError(

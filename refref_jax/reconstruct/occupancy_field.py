@@ -106,7 +106,7 @@ def slope(
     """
     corners = jnp.asarray(_TETRAHEDRON)
     values = jax.vmap(functools.partial(signed, params, config))(position[None] + step * corners)
-    return values @ corners / (4.0 * step)
+    return numerics.product(values, corners) / (4.0 * step)
 
 
 class _OccupancyField(nn.Module):

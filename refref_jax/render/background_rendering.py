@@ -265,8 +265,10 @@ def _seen(radiance: Radiance, ends: PathEnds) -> Array:
     if ends.differentials.points.shape[1] == 0:
         return look(ends.origins, ends.directions)
 
+    exact = functools.partial(jnp.einsum, precision=jax.lax.Precision.HIGHEST)
+
     def look_beside(offset: Float[Array, "2"]) -> Array:
-        moved = jax.tree.map(lambda axes: jnp.einsum("a,pax->px", offset, axes), ends.differentials)
+        moved = jax.tree.map(lambda axes: exact("a,pax->px", offset, axes), ends.differentials)
         directions = jax.vmap(numerics.normalize)(ends.directions + moved.directions)
         return look(ends.origins + moved.points, directions)
 

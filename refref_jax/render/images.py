@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax.choices import side_of
+from refref_jax.compilation import runs_on_cpu
 from refref_jax.geometry import bvh
 from refref_jax.geometry.cameras import Cameras, box_filter, pixel_rays, supersample
 from refref_jax.geometry.rays import Rays
@@ -46,10 +47,13 @@ _SMALLEST_TILE = 1024
 _Tree = TypeVar("_Tree")
 
 TILE = 16384
-"""Number of rays traced at once."""
+"""Number of rays traced at once on a CPU; see `on_this_device`."""
 
 CHUNK = 4096
-"""Number of paths rendered at once. Lower it if memory runs out."""
+"""Number of paths rendered at once on a CPU; see `on_this_device`."""
+
+# An accelerator takes as many times the rays and paths, since the host waits for each tile.
+_TIMES = 16
 
 CAST_TILE = 65536
 """Number of rays cast at once."""
@@ -101,9 +105,19 @@ def in_tiles(
     return jax.tree.map(lambda x: x[:count].reshape((*shape, *x.shape[1:])), joined)
 
 
+def on_this_device(size: int) -> int:
+    """Returns the size of a tile or chunk on this process's devices: larger off CPUs."""
+    return size if runs_on_cpu() else _TIMES * size
+
+
 def size_for(rays: int, *, most: int) -> int:
     """Returns the tile size for a number of rays: smaller tiles for few rays."""
     return min(most, max(_SMALLEST_TILE, 1 << max(rays - 1, 0).bit_length()))
+
+
+def tile_for(rays: int) -> int:
+    """Returns the number of rays to trace at once on this process's devices."""
+    return size_for(rays, most=on_this_device(TILE))
 
 
 def join(parts: Sequence[_Tree]) -> _Tree:
@@ -209,14 +223,15 @@ def render_rays(model: Model, rays: Rays) -> Rendering:
 
 
 def render_image(
-    model: Model, rays: Rays, *, chunk: int = CHUNK, branch: Branch = "both"
+    model: Model, rays: Rays, *, chunk: int | None = None, branch: Branch = "both"
 ) -> Rendering:
     """Renders any number of rays in chunks of fixed size; 0 rays give an empty rendering.
 
     Args:
       model: trained model.
       rays: camera rays with any leading axes, usually `[height, width]`.
-      chunk: number of paths rendered at once; a backdrop renders those of a tile.
+      chunk: number of paths rendered at once, by default 4096, and 65,536 off CPUs; lower it if
+        memory runs out. A backdrop renders those of a tile.
       branch: selection of paths by their branch at the first surface. The linear colours of
         `transmitted` and `reflected` sum to those of `both`. All three use one compiled program.
 
@@ -229,6 +244,7 @@ def render_image(
     """
     if branch not in _BRANCHES:
         raise ValueError(f"branch is {branch!r}, unknown. Use one of {', '.join(_BRANCHES)}.")
+    chunk = on_this_device(CHUNK) if chunk is None else chunk
     if chunk < 1:
         raise ValueError(f"chunk is {chunk}, but a chunk needs paths. Give 1 or more.")
     rays = jax.tree.map(np.float32, fetch(rays, instead=_INSTEAD))
@@ -236,7 +252,7 @@ def render_image(
     return in_tiles(
         lambda tile, _, real: _render_tile(model, tile, real, chunk, branch),
         rays,
-        tile=TILE,
+        tile=tile_for(max(rays.radii.size, TILE)),
         nothing=nothing,
         instead=_INSTEAD,
     )
@@ -355,7 +371,7 @@ def render_camera(
     view: int,
     *,
     rays_per_pixel: int = 1,
-    chunk: int = CHUNK,
+    chunk: int | None = None,
     band: int = RAYS_OF_A_BAND,
 ) -> Rendering:
     """Renders one camera's image, with one or several rays in every pixel.
@@ -367,7 +383,7 @@ def render_camera(
       cameras: cameras with the resolution of the image.
       view: index of the camera.
       rays_per_pixel: number of rays in each pixel, a square: 1, 4, 9, 16.
-      chunk: number of paths rendered at once.
+      chunk: number of paths rendered at once, as in `render_image`.
       band: number of rays held at once; at least one row of pixels is.
 
     Returns:
@@ -386,7 +402,7 @@ def render_camera(
     return join(bands)
 
 
-def warm_up(model: Model, cameras: Cameras, *, chunk: int) -> None:
+def warm_up(model: Model, cameras: Cameras, *, chunk: int | None) -> None:
     """Compiles all programs of rendering, so that later timings are of rendering alone."""
     zero = np.zeros(1, np.int64)
     render_image(model, pixel_rays(cameras, zero, zero, zero), chunk=chunk)

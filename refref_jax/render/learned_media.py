@@ -16,6 +16,7 @@ import numpy as np
 import scipy.optimize
 from jaxtyping import Array, Float
 
+from refref_jax import numerics
 from refref_jax.optics.light_paths import LightPaths
 
 # Almost white, with a useful slope of the softplus.
@@ -82,7 +83,7 @@ def attenuate(learned: LearnedTints | None, paths: LightPaths, *, radius: float)
     """
     if learned is None:
         return paths
-    dimmed = jnp.exp(-crossings(paths, radius=radius) @ densities(learned))
+    dimmed = jnp.exp(numerics.product(-crossings(paths, radius=radius), densities(learned)))
     return paths._replace(throughput=paths.throughput * dimmed)
 
 

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
+from refref_jax import numerics
 from refref_jax.choices import Space
 from refref_jax.geometry import cameras as cameras_module
 from refref_jax.geometry.cameras import Cameras
@@ -176,7 +177,7 @@ def read(
     scene = jax.device_put(scene)
     rays_per_view = photographs.shape[1] * photographs.shape[2] * side**2
     group, done = max(1, images.RAYS_OF_A_BAND // rays_per_view), itertools.count(1)
-    tile = images.size_for(min(group, len(photographs)) * rays_per_view, most=images.TILE)
+    tile = images.tile_for(min(group, len(photographs)) * rays_per_view)
 
     look = functools.partial(
         _look,
@@ -445,7 +446,7 @@ def _transposed(slopes: Array, block: Block, *, resolution: int) -> Mips:
 @jax.jit
 def _attenuated(block: Block, tints: LearnedTints) -> Block:
     """Returns the equations with the throughput that tints and absorption leave."""
-    dimmed = jnp.exp(-block.crossings @ learned_media.densities(tints))
+    dimmed = jnp.exp(numerics.product(-block.crossings, learned_media.densities(tints)))
     lookups = block.lookups._replace(throughput=block.lookups.throughput * dimmed)
     return block._replace(lookups=lookups)
 

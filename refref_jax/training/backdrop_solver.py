@@ -31,6 +31,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from refref_jax import numerics
 from refref_jax.choices import Space
 from refref_jax.render import backdrop, learned_media, pixels
 from refref_jax.render.backdrop import Mips, Pyramid
@@ -465,7 +466,7 @@ def _tint_equations(
     typical: float | Array,
 ) -> tuple[Float[Array, "3 unknowns unknowns"], Float[Array, "3 unknowns"]]:
     """Returns normal matrix and right-hand side of a Gauss-Newton step, for each channel."""
-    light = block.lookups.throughput * jnp.exp(-block.crossings @ densities) * seen
+    light = block.lookups.throughput * jnp.exp(numerics.product(-block.crossings, densities)) * seen
 
     def summed(light: Array) -> Array:
         return jax.ops.segment_sum(light, block.lookups.pixels, num_segments=block.srgb.shape[0])

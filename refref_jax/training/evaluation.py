@@ -31,7 +31,7 @@ from refref_jax.data import scene_folder
 from refref_jax.geometry import cameras
 from refref_jax.geometry.cameras import Cameras
 from refref_jax.render import images, learned_media
-from refref_jax.render.images import CHUNK, Rendering
+from refref_jax.render.images import Rendering
 from refref_jax.render.model import Model
 
 Measured = dict[str, float | None]
@@ -106,7 +106,7 @@ def evaluate(
     split: str = "test",
     rays_per_pixel: int = 1,
     limit: int | None = None,
-    chunk: int = CHUNK,
+    chunk: int | None = None,
     perceptual: Perceptual = _WITHOUT_EYES,
     progress: Callable[[int, int, str], None] | None = None,
     on_view: Callable[[EvaluatedView], None] | None = None,
@@ -121,7 +121,7 @@ def evaluate(
       split: `train`, `val` or `test`.
       rays_per_pixel: number of rays in each pixel, a square.
       limit: number of images to evaluate, evenly spread; all if not given.
-      chunk: number of paths rendered at once.
+      chunk: number of paths rendered at once, as in `render.render_image`.
       perceptual: perceptual metrics to compute in addition.
       progress: function of the number of images done, their total, and a line of text; called
         once before the first image and after each.

@@ -16,6 +16,7 @@ import optax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Int, UInt8
 
+from refref_jax.compilation import runs_on_cpu
 from refref_jax.data.batches import PixelSampler
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import light_paths, path_tracing
@@ -43,6 +44,9 @@ _ANNEAL_SLOPE = 10.0
 
 # Number of pixels from which the capacity for the paths of a batch is estimated.
 _SURVEY = 1 << 14
+
+MULTIPLE = 128
+"""Number that divides the capacity for the paths of a batch on accelerators."""
 
 # Maximum memory for the light paths of all pixels.
 _MOST_BYTES = 1 << 29
@@ -319,7 +323,11 @@ def set_up(
     found = devices.as_in_the_first(jax.device_get(found))
     batch = require(config.schedule.batch)
     capacity = capacity_for(
-        settings, batch, mean=float(found.mean), deviation=float(found.deviation)
+        settings,
+        batch,
+        mean=float(found.mean),
+        deviation=float(found.deviation),
+        multiple=8 if runs_on_cpu() else MULTIPLE,
     )
     hit_fraction = float(found.hit_fraction)
     scene = devices.put_everywhere(scene, mesh=mesh)

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-from refref_jax.optics import path_tracing
+from refref_jax.optics import media, path_tracing, wavefront
 from refref_jax.optics.light_paths import PathStatus
 from refref_jax.optics.path_settings import PAPER, PATH_PRESETS, TREE, PathSettings, capacities
 from tests.factories import scenes
@@ -228,6 +228,23 @@ def test_the_block_of_a_round_changes_nothing(block):
         lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), _by_ray(found), _by_ray(expected)
     )
     assert in_blocks.casts == all_at_once.casts
+
+
+def test_accelerators_cast_all_rays_at_once_into_lists_of_the_same_size(monkeypatch):
+    # Of a CPU, two blocks of 16.
+    monkeypatch.setattr(wavefront, "_BLOCK_ON_CPU", 16)
+    scene, rays = scenes.build(scenes.box((1.0, 1.2, 1.4))), _towards_a_ball(32)
+    settings = dataclasses.replace(TREE, max_bends=2)
+    inside = np.broadcast_to(np.asarray(media.empty_interior_list(scene.interfaces)), (32, 0))
+    trees = [
+        jax.jit(functools.partial(follow, settings=settings, footprint="cone"))(scene, rays, inside)
+        for follow in (wavefront._at_once, wavefront._in_cached_blocks)
+    ]
+    once, in_blocks = trees
+    assert jax.tree.map(np.shape, once) == jax.tree.map(np.shape, in_blocks)
+    assert once.casts == in_blocks.casts and once.ends.count == in_blocks.ends.count
+    found = [np.sort(tree.ends.items.throughput[: tree.ends.count, 0]) for tree in trees]
+    np.testing.assert_allclose(*found, rtol=1e-5)
 
 
 @pytest.mark.slow

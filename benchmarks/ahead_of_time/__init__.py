@@ -1,0 +1,1 @@
+"""Compiles programs of the library for an H100, without one, and counts what they cost."""
