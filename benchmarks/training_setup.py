@@ -2,31 +2,44 @@
 
 from pathlib import Path
 
+from jax.sharding import Mesh
+
 from refref_jax.data import scene_folder
 from refref_jax.data.batches import PixelSampler
 from refref_jax.fields import registry
-from refref_jax.training import loop
+from refref_jax.training import devices, loop
 from refref_jax.training.config import TrainConfig
 from refref_jax.training.fit import prepare
 from refref_jax.training.loop import PretracedBatches, TrainState, init_state
 
 
-def set_up_training(scene: Path, *, preset: str, paths: str) -> tuple[loop.Setup, TrainState]:
+def set_up_training(
+    scene: Path,
+    *,
+    preset: str,
+    paths: str,
+    samples: tuple[int, ...] | None = None,
+    mesh: Mesh | None = None,
+) -> tuple[loop.Setup, TrainState]:
     """Returns a run before its first step, with the scene analysis of training.
-
-    All paths have the preset's usual samples, so that only the paths differ.
 
     Args:
       scene: folder of the scene.
       preset: name of a preset.
       paths: name of path settings.
+      samples: samples of each level; by default the preset's usual ones, whatever the scene needs,
+        so that only the paths differ.
+      mesh: devices that train together; `None` for a single one.
     """
+    samples = samples or usual_samples(preset)
     asked = TrainConfig().override(
-        scene=str(scene), preset=preset, paths=paths, samples_per_ray=usual_samples(preset)
+        scene=str(scene), preset=preset, paths=paths, samples_per_ray=samples
     )
     (config, model, *_), objects = prepare(asked)
-    setup = loop.set_up(config, model.config, model.settings, objects, sampler_of(config))
-    return setup, init_state(config.seed, model.config, config.schedule)
+    pixels = sampler_of(config)
+    setup = loop.set_up(config, model.config, model.settings, objects, pixels, mesh=mesh)
+    state = init_state(config.seed, model.config, config.schedule)
+    return setup, devices.put_everywhere(state, mesh=mesh)
 
 
 def usual_samples(preset: str) -> tuple[int, ...]:
