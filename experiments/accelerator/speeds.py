@@ -61,7 +61,7 @@ _MOST_COPIES = 6.0
 # Milliseconds per step on an H100, estimated from programs compiled for one, before any run.
 _ESTIMATES = {
     "steps": {"tiny": "0.4 to 0.6", "paper": "13 to 18"},
-    "tracing": {"tiny": "about 1.6", "paper": "about 5, or 1 to 2 in large blocks"},
+    "tracing": {"tiny": "0.5 to 1", "paper": "1 to 2"},
 }
 
 # PSNR of the pixels that a backdrop is fitted to, dB; on a CPU it is 29.7 with few cells and views,
