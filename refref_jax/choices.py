@@ -100,7 +100,7 @@ Interior = Literal["field", "clear", "absorbing"]
 """Model of the inside of the objects; see `render.model.ModelConfig`."""
 
 ColourNetwork = Literal["plain", "skip"]
-"""Layers of the colour network: plain, or with a skip connection; see `fields.mlps`."""
+"""Layers of the colour network: plain, or with a skip connection; see `fields.hash_grid`."""
 
 Contraction = Literal["unbounded", "always"]
 """Scenes whose space is contracted: unbounded ones, or all; see `training.presets.contracted`."""

@@ -42,7 +42,7 @@ from typing import Any
 import numpy as np
 
 from refref_jax.choices import ORIGIN, InFront, Interior, Position, Space
-from refref_jax.fields import mlps, registry
+from refref_jax.fields import hash_grid, registry
 from refref_jax.fields.base import RadianceConfig
 from refref_jax.fields.hash_grid import HashGridConfig
 from refref_jax.geometry.cameras import Cameras
@@ -225,7 +225,7 @@ def override_model(
         model = dataclasses.replace(model, proposals=proposals, field=field)
     field = _with_grid(model.field, asked)
     if asked.colour_network != "plain":
-        if not isinstance(field, mlps.GridRadianceConfig):
+        if not isinstance(field, hash_grid.GridRadianceConfig):
             raise ValueError(
                 f"colour_network={asked.colour_network} is an option of field kinds with a hash "
                 f"grid, unlike {field.kind}. Leave it out."
@@ -252,7 +252,7 @@ def _with_samples(model: ModelConfig, samples: tuple[int, ...], preset: str) -> 
 def _with_grid(field: RadianceConfig, asked: FieldConfig) -> RadianceConfig:
     if asked.log2_hashmap_size is None and asked.max_res is None:
         return field
-    if not isinstance(field, mlps.GridRadianceConfig):
+    if not isinstance(field, hash_grid.GridRadianceConfig):
         raise ValueError(
             "log2_hashmap_size and max_res are options of a hash grid, which field kind "
             f"{field.kind} does not have. Leave them out."
@@ -277,7 +277,7 @@ def samples_of(model: ModelConfig) -> tuple[int, ...]:
 
 def grid_of(model: ModelConfig) -> HashGridConfig | None:
     """Returns the hash grid of a model's radiance field, if its field kind has one."""
-    return model.field.grid if isinstance(model.field, mlps.GridRadianceConfig) else None
+    return model.field.grid if isinstance(model.field, hash_grid.GridRadianceConfig) else None
 
 
 def sampling_of(model: ModelConfig) -> dict[str, Any]:
