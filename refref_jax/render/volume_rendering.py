@@ -4,9 +4,7 @@ Symbols, as in the paper (arXiv 2505.05848, section 4.1): interval `i` has densi
 length `delta_i`; `T_i = exp(-sum_{j<i} sigma_j delta_j)` is the light that reaches it and
 `w_i = T_i (1 - exp(-sigma_i delta_i))` its weight in the colour.
 
-All functions of paths take one path; `pixels` maps them over a batch. `look_up` queries the fields
-of a model at world points, without light paths, to export surfaces and point clouds; the field
-inside objects is meaningless if the model takes no samples there.
+All functions take one path; `pixels` maps them over a batch.
 
 Source: Barron et al., Mip-NeRF 360 (2022), section 3, and Zip-NeRF (2023); paper (arXiv
 2505.05848), section 4.2, for samples and directions on the bent path.
@@ -256,7 +254,7 @@ def _opaque_surface(params: Params, config: ModelConfig, whole: Polyline) -> Flo
     assert whole.stop is not None
     at = jnp.where(jnp.isfinite(whole.stop), whole.stop, 0.0)
     cone = polylines.multisamples(whole, at, at, jnp.zeros_like(at), count=config.multisamples)
-    cell = scene_bounds.to_unit_cube(domain(config), cone)
+    cell = scene_bounds.to_unit_cube(config.domain, cone)
     direction = polylines.point_at(whole, at).direction
     return registry.radiance(_field_of(params), config.field, cell, direction).rgb
 
@@ -306,18 +304,13 @@ def distance_warp(config: ModelConfig, line: Polyline) -> scene_bounds.DistanceW
     background.
     """
     last = jnp.sum(jnp.isfinite(line.knots)) - 1
-    leave = scene_bounds.exit_distance(domain(config), line.points[last], line.directions[last])
+    leave = scene_bounds.exit_distance(config.domain, line.points[last], line.directions[last])
     far = line.knots[last] + jnp.where(jnp.isfinite(leave), leave, config.far)
     if line.stop is not None:
         far = jnp.where(jnp.isfinite(line.stop), line.stop, far)
     # Keep a minimum length for samples even if the camera is on the scene bounds.
     far = jnp.maximum(far, config.near + _SHORTEST * config.radius)
     return scene_bounds.DistanceWarp(config.near, far, config.radius)
-
-
-def domain(config: ModelConfig) -> scene_bounds.Domain:
-    """Returns the scene bounds of a model."""
-    return scene_bounds.Domain(config.radius, config.space, config.centre)
 
 
 def polyline(config: ModelConfig, path: LightPaths) -> Polyline:
@@ -368,7 +361,7 @@ def sample(
 
     def cone(start: Array, end: Array, turn: Array) -> Gaussians:
         world = polylines.multisamples(line, start, end, turn, count=config.multisamples)
-        return scene_bounds.to_unit_cube(domain(config), world)
+        return scene_bounds.to_unit_cube(config.domain, world)
 
     return Samples(s, t, jax.vmap(cone)(starts, ends, turns), points)
 
@@ -418,50 +411,3 @@ def _in_arc_length(line: Polyline, composite: Composite) -> Composite:
     arc = jax.vmap(lambda t: polylines.point_at(line, t).arc)
     median, mean = arc(jnp.stack([composite.median, composite.mean]))
     return composite._replace(median=median, mean=mean)
-
-
-class FieldPoint(NamedTuple):
-    """Values of the field at a point.
-
-    Attributes:
-      density: density per world unit, non-negative: the transmittance of a short distance `dt` is
-        `exp(-density dt)`.
-      linear: linear RGB radiance, opposite to the direction of travel.
-    """
-
-    density: Float[Array, ""]
-    linear: Float[Array, "3"]
-
-
-def look_up(
-    params: Params,
-    config: ModelConfig,
-    point: Float[Array, "3"],
-    direction: Float[Array, "3"],
-    *,
-    width: float,
-) -> FieldPoint:
-    """Returns density and colour at one point; map it over many.
-
-    Args:
-      params: parameters of the model.
-      config: configuration of the model.
-      point: position in world units; beyond the scene bounds, their nearest point is used.
-      direction: unit direction of travel of the viewing path.
-      width: edge of the cell around the point, world units: finer detail is blurred.
-
-    Raises:
-      ValueError: if the model has a backdrop instead of fields.
-    """
-    if config.backdrop is not None:
-        raise ValueError(
-            "This model has a backdrop in place of a field, so there is no density to look up. "
-            "Train it with far_field=field."
-        )
-    # Standard deviation of a cube along each axis.
-    scale = jnp.full((1,), width, point.dtype) / jnp.sqrt(jnp.asarray(12.0, point.dtype))
-    bounds = domain(config)
-    held = scene_bounds.nearest_within(bounds, point)
-    cell = scene_bounds.to_unit_cube(bounds, Gaussians(held[None], scale))
-    seen = registry.radiance(params.field, config.field, cell, direction)
-    return FieldPoint(seen.density / config.radius, seen.rgb)
