@@ -244,7 +244,18 @@ def colour(
     direction: Float[Array, "3"],
     config: GridRadianceConfig,
 ) -> Float[Array, "3"]:
-    """Returns a colour in `[0, 1]` from the bottleneck features and a unit direction.
+    """Returns a colour in `[0, 1]` from the bottleneck features and a unit direction."""
+    return jax.nn.sigmoid(directional_network(bottleneck, direction, config, outputs=3))
+
+
+def directional_network(
+    bottleneck: Float[Array, " bottleneck"],
+    direction: Float[Array, "3"],
+    config: GridRadianceConfig,
+    *,
+    outputs: int,
+) -> Float[Array, " outputs"]:
+    """Returns the output of the colour network, without activation.
 
     Source: Zip-NeRF's code in PyTorch, on which the paper's is based, for the skip connection.
     """
@@ -254,4 +265,4 @@ def colour(
         hidden = nn.relu(layer(config.colour_width)(hidden))
         if i == 0 and config.colour_network == "skip":
             hidden = jnp.concatenate([hidden, inputs])
-    return jax.nn.sigmoid(layer(3)(hidden))
+    return layer(outputs)(hidden)

@@ -25,7 +25,7 @@ from refref_jax.choices import (
     ViewDependence,
 )
 from refref_jax.fields import base, registry
-from refref_jax.fields.base import DensityConfig, RadianceConfig
+from refref_jax.fields.base import DensityConfig, Radiance, RadianceConfig
 from refref_jax.optics.path_settings import Detail, PathSettings, Tally
 from refref_jax.optics.scene import Scene
 from refref_jax.render import backdrop, learned_media
@@ -282,12 +282,17 @@ def look_up(
       width: edge of the cell around the point, world units: finer detail is blurred.
 
     Raises:
-      ValueError: if the model has a backdrop instead of fields.
+      ValueError: if the model has a backdrop instead of fields, or its field has sub-spaces.
     """
     if config.backdrop is not None:
         raise ValueError(
             "This model has a backdrop in place of a field, so there is no density to look up. "
             "Train it with far_field=field."
+        )
+    if registry.has_sub_spaces(config.field):
+        raise ValueError(
+            f"A point has no colour in fields of kind {config.field.kind}, which blends sub-spaces "
+            "along whole paths. Train with field=zipnerf."
         )
     # Standard deviation of a cube along each axis.
     scale = jnp.full((1,), width, point.dtype) / jnp.sqrt(jnp.asarray(12.0, point.dtype))
@@ -295,4 +300,5 @@ def look_up(
     held = scene_bounds.nearest_within(bounds, point)
     cell = scene_bounds.to_unit_cube(bounds, Gaussians(held[None], scale))
     seen = registry.radiance(params.field, config.field, cell, direction)
+    assert isinstance(seen, Radiance)
     return FieldPoint(seen.density / config.radius, seen.rgb)

@@ -10,8 +10,9 @@ Source: Barron et al., Mip-NeRF 360 (2022), section 3, and Zip-NeRF (2023); pape
 2505.05848), section 4.2, for samples and directions on the bent path.
 """
 
+import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -21,7 +22,7 @@ from jaxtyping import Array, Bool, Float
 from refref_jax import numerics
 from refref_jax.choices import LastSample
 from refref_jax.fields import base, registry
-from refref_jax.fields.base import Radiance
+from refref_jax.fields.base import Radiance, SubSpaces
 from refref_jax.optics.light_paths import LightPaths
 from refref_jax.render.model import Layers, ModelConfig, Params
 from refref_jax.sampling import polylines, scene_bounds, stepfun
@@ -187,8 +188,8 @@ def path_radiance(
     line = polyline(config, path)
     warp = distance_warp(config, line)
     samples, seen, histograms = _sampled(params, config, line, warp, jitter, anneal)
-    weights = _weigh(config, seen.density, samples.t)
-    composited = composite(weights, seen.rgb, samples.t, last_sample=_last_sample(config))
+    weigh = functools.partial(_weigh, config, edges=samples.t)
+    weights, composited = integrate(params, config, seen, samples.t, weigh=weigh)
     return PathRadiance(
         composite=_in_arc_length(line, composited),
         histograms=(*histograms, Histogram(samples.s, weights)),
@@ -219,8 +220,12 @@ def foreground_radiance(
         far = jnp.maximum(length, _SHORTEST * config.radius)
         warp = scene_bounds.DistanceWarp(0.0, far, config.radius)
         samples, seen, proposed = _sampled(params, config, line, warp, jitter, anneal)
-        weights = jnp.where(length > 0.0, _weigh(config, seen.density, samples.t), 0.0)
-        front = _in_arc_length(line, composite(weights, seen.rgb, samples.t))
+
+        def weigh(density: Array) -> Array:
+            return jnp.where(length > 0.0, _weigh(config, density, samples.t), 0.0)
+
+        weights, front = integrate(params, config, seen, samples.t, weigh=weigh)
+        front = _in_arc_length(line, front)
         histograms = (*proposed, Histogram(samples.s, weights))
         outside = samples.points.outside
     if path.stop is not None:
@@ -229,6 +234,41 @@ def foreground_radiance(
         closed = in_front_of(front, rgb, stop)
         front = jax.tree.map(lambda x, y: jnp.where(jnp.isfinite(stop), x, y), closed, front)
     return PathRadiance(front, histograms, outside)
+
+
+def integrate(
+    params: Params,
+    config: ModelConfig,
+    seen: Radiance | SubSpaces,
+    edges: Float[Array, " edges"],
+    *,
+    weigh: Callable[[Array], Array],
+) -> tuple[Float[Array, " samples"], Composite]:
+    """Returns the weights of the intervals, and colour and distances of the path.
+
+    Sub-spaces are weighed and integrated each by itself, decoded, and blended by their shares, in
+    colour and weights. As much light passes through one as its own weights are short of 1.
+
+    Args:
+      params: parameters of the model.
+      config: configuration of the model.
+      seen: what the field returned for each interval.
+      edges: distances of the edges of the intervals.
+      weigh: function of the densities of all intervals that returns their weights.
+
+    Source: Yin et al., Multi-Space Neural Radiance Fields (2023), section 3, for sub-spaces.
+    """
+    last_sample = _last_sample(config)
+    if isinstance(seen, Radiance):
+        weights = weigh(seen.density)
+        return weights, composite(weights, seen.rgb, edges, last_sample=last_sample)
+    each = jax.vmap(weigh, in_axes=-1, out_axes=-1)(seen.density)
+    features = jnp.sum(each[..., None] * seen.features, axis=0)
+    blend = registry.blend(_field_of(params), config.field, features)
+    weights = jnp.sum(each * blend.shares, axis=-1)
+    rgb = jnp.sum((blend.shares * jnp.sum(each, axis=0))[:, None] * blend.rgb, axis=0)
+    composited = composite(weights, jnp.zeros((*weights.shape, 3)), edges, last_sample=last_sample)
+    return weights, composited._replace(rgb=rgb)
 
 
 def in_front_of(front: Composite, rgb: Float[Array, "3"], distance: Float[Array, ""]) -> Composite:
@@ -256,7 +296,11 @@ def _opaque_surface(params: Params, config: ModelConfig, whole: Polyline) -> Flo
     cone = polylines.multisamples(whole, at, at, jnp.zeros_like(at), count=config.multisamples)
     cell = scene_bounds.to_unit_cube(config.domain, cone)
     direction = polylines.point_at(whole, at).direction
-    return registry.radiance(_field_of(params), config.field, cell, direction).rgb
+    seen = registry.radiance(_field_of(params), config.field, cell, direction)
+    if isinstance(seen, Radiance):
+        return seen.rgb
+    blend = registry.blend(_field_of(params), config.field, seen.features)
+    return jnp.sum(blend.shares[:, None] * blend.rgb, axis=0)
 
 
 def _field_of(params: Params) -> base.Params:
@@ -270,7 +314,7 @@ def _sampled(
     warp: scene_bounds.DistanceWarp,
     jitter: Jitter,
     anneal: Float[Array, ""],
-) -> tuple[Samples, Radiance, list[Histogram]]:
+) -> tuple[Samples, Radiance | SubSpaces, list[Histogram]]:
     """Returns the final samples, what the field returns there, and the proposals' histograms."""
 
     def drawn(level: int, count: int) -> Samples:
