@@ -117,9 +117,9 @@ def _with_field(run: Path) -> Model:
         )
     if registry.has_sub_spaces(model.config.field):
         raise ValueError(
-            f"{run} has fields of kind {model.config.field.kind}, which blends its sub-spaces along "
-            "whole light paths: a point has no density and colour. Use experiments.render, or "
-            "export a run with --field=zipnerf."
+            f"{run} has fields of kind {model.config.field.kind}, whose sub-spaces are blended "
+            "along whole light paths: a point has no density and colour. Use experiments.render, "
+            "or export a run with --field=zipnerf."
         )
     return model
 

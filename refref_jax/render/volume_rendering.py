@@ -265,7 +265,7 @@ def integrate(
     each = jax.vmap(weigh, in_axes=-1, out_axes=-1)(seen.density)
     features = jnp.sum(each[..., None] * seen.features, axis=0)
     blend = registry.blend(_field_of(params), config.field, features)
-    weights = jnp.sum(each * blend.shares, axis=-1)
+    weights = jnp.sum(each * blend.shares[None], axis=-1)
     rgb = jnp.sum((blend.shares * jnp.sum(each, axis=0))[:, None] * blend.rgb, axis=0)
     composited = composite(weights, jnp.zeros((*weights.shape, 3)), edges, last_sample=last_sample)
     return weights, composited._replace(rgb=rgb)
