@@ -131,7 +131,8 @@ class _RadianceField(nn.Module):
             precision=config.precision,
         )
         rgb = colour(raw[1:], direction, config)
-        return Radiance(activate_density(raw[0]), pad_colour(rgb))
+        padded = pad_colour(rgb)
+        return Radiance(activate_density(raw[0]), padded)
 
 
 def _proposal(

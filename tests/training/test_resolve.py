@@ -516,7 +516,7 @@ def test_shading_reaches_the_normals_of_the_scene(shading, stored):
 
 def test_a_skip_reaches_the_colour_network():
     assert _resolve(_CLEAR).model.config.field.colour_network == "plain"
-    for field in ("zipnerf", "nerfacto"):
+    for field in ("zipnerf", "nerfacto", "msnerf"):
         made = _resolve(_CLEAR, field=field, colour_network="skip")
         assert made.model.config.field.colour_network == "skip"
 
