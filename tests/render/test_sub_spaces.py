@@ -49,9 +49,9 @@ _PLANTED = MsnerfParams(None, None)
 
 
 def _bent():
-    return made_paths.path(
-        [2.0, 1.5], [(0, 0, -1), (0, 0.6, -0.8), (0, 0, -1)], [0, 1, 0], origin=(0, 0, 3)
-    )
+    """Enters an object after 1 unit, and leaves it after another 1.5."""
+    directions = [(0, 0, -1), (0.6, 0, -0.8), (0, 0, -1)]
+    return made_paths.path([1.0, 1.5], directions, [0, 1, 0], origin=(0, 0, 2.5))
 
 
 def _total(params, config, path, jitter, anneal):
