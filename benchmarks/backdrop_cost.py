@@ -41,7 +41,6 @@ def measure(scene: str, enlarge: int, point: dict[str, float]) -> dict[str, floa
     """Returns what one point costs; to be called in a process of its own."""
     from refref_jax import TrainConfig
     from refref_jax.data import scene_folder
-    from refref_jax.render import volume_rendering
     from refref_jax.training import backdrop_equations, backdrop_solver, fit
 
     config = TrainConfig().override(scene=scene, far_field="backdrop", paths="tree")
@@ -56,7 +55,7 @@ def measure(scene: str, enlarge: int, point: dict[str, float]) -> dict[str, floa
         width=images.shape[2],
         focal=enlarge * frames.cameras.focal,
     )
-    cells, domain = int(point["cells"]), volume_rendering.domain(resolved.model.config)
+    cells, domain = int(point["cells"]), resolved.model.config.domain
     start = time.monotonic()
     blocks = backdrop_equations.read(
         objects,

@@ -254,6 +254,13 @@ BUGS = (
         ("render/test_transport.py::test_weights_follow_from_densities_and_lengths",),
     ),
     Bug(
+        "sub-spaces have equal shares in the weights",
+        _VOLUME,
+        "jnp.sum(each * blend.shares[None], axis=-1)",
+        "jnp.mean(each, axis=-1)",
+        ("render/test_sub_spaces.py::test_a_path_has_the_numbers_of_the_released_functions",),
+    ),
+    Bug(
         "transmittance includes the own sample",
         _VOLUME,
         "jnp.concatenate([jnp.zeros_like(depth[:1]), jnp.cumsum(depth[:-1])])",

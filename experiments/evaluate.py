@@ -30,6 +30,7 @@ with epy.lazy_imports():
     from experiments.runs import evaluation as reporting
     from experiments.runs import perceptual
     from refref_jax.data import image_files, scene_names
+    from refref_jax.fields import registry
     from refref_jax.render import checkpoint_io
     from refref_jax.training import evaluation, run_folder
 
@@ -65,7 +66,7 @@ def main() -> None:
     scene = cli_scenes.opened(_SCENE.value or config.scene.path)
     sources = {
         "scene": scene_names.of_folder(scene),
-        "method": _method(run, config.paths.name),
+        "method": _method(run, config.paths.name, config.model.field),
         "step": step,
         "rays_per_pixel": _RAYS_PER_PIXEL.value,
     }
@@ -86,10 +87,13 @@ def main() -> None:
     print(f"Next: {app.shell('render', f'--run={run}', '--views=orbit')}")
 
 
-def _method(run: Path, paths: str) -> str:
-    """Returns the name of a run's combination of geometry and light paths."""
+def _method(run: Path, paths: str, field: str) -> str:
+    """Returns the name of a run's combination of geometry, light paths and kind of field."""
     names = _METHODS if object_source.read(run) is None else _RECONSTRUCTED
-    return names.get(paths, paths)
+    name = names.get(paths, paths)
+    if field == registry.USUAL:
+        return name
+    return field if paths == "straight" else f"{name}_{field}"
 
 
 def evaluate(

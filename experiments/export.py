@@ -37,6 +37,7 @@ with epy.lazy_imports():
 
     from experiments.exporting import backdrop_surface, field_mesh, object_meshes
     from refref_jax.data import image_files
+    from refref_jax.fields import registry
     from refref_jax.reconstruct import grids
     from refref_jax.render import checkpoint_io
     from refref_jax.training import run_folder
@@ -106,13 +107,19 @@ def _with_field(run: Path) -> Model:
     """Returns the model of a run.
 
     Raises:
-      ValueError: if it has a backdrop.
+      ValueError: if it has a backdrop, or a field with sub-spaces.
     """
     model = checkpoint_io.load_model(run, step=_STEP.value)
     if model.config.backdrop is not None:
         raise ValueError(
             f"{run} has a backdrop, and no density around the objects. Use --what=textured_mesh, "
             "faces or panorama."
+        )
+    if registry.has_sub_spaces(model.config.field):
+        raise ValueError(
+            f"{run} has fields of kind {model.config.field.kind}, whose sub-spaces are blended "
+            "along whole light paths: a point has no density and colour. Use experiments.render, "
+            "or export a run with --field=zipnerf."
         )
     return model
 

@@ -81,7 +81,7 @@ Paths = Literal["straight", "paper", "tree", "paper_no_reflection", "paper_no_ti
 PresetName = Literal["tiny", "small", "paper", "best"]
 """Sizes of a model and its training; see `training.presets`."""
 
-FieldName = Literal["zipnerf", "nerfacto"]
+FieldName = Literal["zipnerf", "nerfacto", "msnerf"]
 """Field kinds, the default first; see `fields.registry`."""
 
 FarField = Literal["field", "backdrop"]
@@ -100,7 +100,7 @@ Interior = Literal["field", "clear", "absorbing"]
 """Model of the inside of the objects; see `render.model.ModelConfig`."""
 
 ColourNetwork = Literal["plain", "skip"]
-"""Layers of the colour network: plain, or with a skip connection; see `fields.mlps`."""
+"""Layers of the colour network: plain, or with a skip connection; see `fields.hash_grid`."""
 
 Contraction = Literal["unbounded", "always"]
 """Scenes whose space is contracted: unbounded ones, or all; see `training.presets.contracted`."""

@@ -35,7 +35,7 @@ from experiments.accelerator.measuring import (
 from refref_jax import compilation
 from refref_jax.data import scene_folder
 from refref_jax.geometry.cameras import image_rays
-from refref_jax.render import images, volume_rendering
+from refref_jax.render import images
 from refref_jax.render.model import Model
 from refref_jax.training import backdrop_equations, backdrop_solver, fit
 from refref_jax.training.config import TrainConfig
@@ -223,7 +223,7 @@ def backdrop(context: Context) -> Iterator[Row]:
     resolved, objects = fit.prepare(asked, report=lambda line: None)
     frames = scene_folder.read_frames(context.scene, "train")
     views, cells = context.sizes.views, context.sizes.cells
-    domain = volume_rendering.domain(resolved.model.config)
+    domain = resolved.model.config.domain
 
     def trace() -> tuple[backdrop_equations.Block, ...]:
         return backdrop_equations.read(

@@ -25,7 +25,7 @@ OPTIONS = "external"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 # The groups of --methods, the reference of the report, and the shared reconstruction.
-_TAKEN = (*METHODS, RECONSTRUCTION, "main", "ablations", "all", "truth")
+_TAKEN = (*METHODS, RECONSTRUCTION, "main", "baselines", "ablations", "all", "truth")
 
 # Length of a digest.
 _LETTERS = 16

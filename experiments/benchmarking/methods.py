@@ -4,7 +4,8 @@ A method is a set of options of `experiments.train`, so adding one means adding 
 Everything else is that of the preset for all methods: sizes, schedule and footprint. `oracle`,
 `--paths=paper --interior=field`, therefore has the published light paths and fields, and
 `oracle_as_published` also has the scene bounds, normals, losses and evaluation of the paper's
-released code; `docs/benchmark.md` lists the differences that remain. Ablations of `oracle` remove
+released code; `docs/benchmark.md` lists the differences that remain. A baseline is another method
+of the paper's tables: its idea on the fields and preset of all others. Ablations of `oracle` remove
 one component; those of `tree`, our method, change one. An ablation that equals the preset is
 skipped (`same_as`), as is one that equals the scene's own choice (`same_inside`). Nerfacto's fields
 (`oracle_nerfacto`) define their own sizes, samples and footprint, a cone.
@@ -23,7 +24,7 @@ with epy.lazy_imports():
     from refref_jax.training import presets
 
 Need = Literal["meshes", "masks", "colours", "backdrop"]
-Group = Literal["main", "ablation of the oracle", "ablation of the tree"]
+Group = Literal["main", "baseline", "ablation of the oracle", "ablation of the tree"]
 
 RECONSTRUCTION = "reconstruction"
 """Folder for the reconstruction that R3F methods share; no method may have this name."""
@@ -89,8 +90,19 @@ def _varied(name: str, label: str, *options: str, colours: tuple[Need, ...] = ()
     return Method(name, label, "ablation of the tree", train, requires=("meshes", *colours))
 
 
+_STRAIGHT = ("--paths=straight",)
+
 _ALL = (
-    Method("straight", "Straight (Zip-NeRF)", "main", ("--paths=straight",), (), False, "Zip-NeRF"),
+    Method("straight", "Straight (Zip-NeRF)", "main", _STRAIGHT, (), False, "Zip-NeRF"),
+    Method(
+        "msnerf",
+        "MS-NeRF (our fields)",
+        "baseline",
+        (*_STRAIGHT, "--field=msnerf"),
+        (),
+        False,
+        "MS-NeRF",
+    ),
     Method("oracle", "Oracle (paper's paths)", "main", _ORACLE, published="Oracle"),
     Method(
         "oracle_as_published",
@@ -152,7 +164,7 @@ METHODS: dict[str, Method] = {method.name: method for method in _ALL}
 _OF_INSIDE = ("interior", "tints")
 
 FULL: dict[Group, str] = {"ablation of the oracle": "oracle", "ablation of the tree": "tree"}
-"""Reference method of each group of ablations."""
+"""Reference method of each group of ablations; the other groups are compared with each other."""
 
 
 def same_as(method: Method, preset: str) -> str | None:
@@ -190,7 +202,7 @@ def parse(names: Sequence[str]) -> list[Method]:
     """Returns methods by name, in the order of tables.
 
     Args:
-      names: names of methods; `main`, `ablations` and `all` are groups of them.
+      names: names of methods; `main`, `baselines`, `ablations` and `all` are groups of them.
 
     Raises:
       ValueError: if the list is empty, or a name is unknown.
@@ -204,8 +216,8 @@ def parse(names: Sequence[str]) -> list[Method]:
 def _meaning(word: str) -> list[str]:
     groups = {
         "main": [method.name for method in _ALL if method.group == "main"],
-        "ablations": [method.name for method in _ALL if method.group != "main"]
-        + ["oracle", "tree"],
+        "baselines": [method.name for method in _ALL if method.group == "baseline"],
+        "ablations": [method.name for method in _ALL if method.group in FULL] + ["oracle", "tree"],
         "all": list(METHODS),
     }
     if word not in METHODS and word not in groups:

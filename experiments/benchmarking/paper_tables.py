@@ -193,7 +193,7 @@ def _without_ablations(found: Sequence[Record]) -> list[Record]:
     return [
         record
         for record in found
-        if record.method not in METHODS or METHODS[record.method].group == "main"
+        if record.method not in METHODS or METHODS[record.method].group not in FULL
     ]
 
 

@@ -17,7 +17,7 @@ from PIL import Image
 from refref_jax.data import image_files
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import light_paths
-from refref_jax.render import backdrop, pixels, volume_rendering
+from refref_jax.render import backdrop, pixels
 from refref_jax.render.model import Model, surface_of
 from refref_jax.sampling.scene_bounds import Domain
 
@@ -84,7 +84,7 @@ def panorama(model: Model, *, height: int) -> Float[np.ndarray, "h w 3"]:
       model: model with a backdrop.
       height: number of rows; there are twice as many columns.
     """
-    domain = volume_rendering.domain(model.config)
+    domain = model.config.domain
     elevation = np.pi * (0.5 - (np.arange(height) + 0.5) / height)
     azimuth = np.pi * (1.0 - (np.arange(2 * height) + 0.5) / height)
     elevation, azimuth = np.meshgrid(elevation, azimuth, indexing="ij")
@@ -120,7 +120,7 @@ def write_textured_mesh(path: Path, model: Model) -> None:
 
     The light that a face emits is its texture; an environment is put on a distant sphere.
     """
-    domain, grid = volume_rendering.domain(model.config), faces(model)
+    domain, grid = model.config.domain, faces(model)
     scene = trimesh.Scene()
     for number, values in enumerate(grid):
         name = f"{'-+'[number % 2]}{'xyz'[number // 2]}"

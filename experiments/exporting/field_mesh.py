@@ -25,7 +25,7 @@ from refref_jax.reconstruct import grids
 from refref_jax.reconstruct.grids import Grid
 from refref_jax.render import Model, pixels
 from refref_jax.render.images import find_first_surface
-from refref_jax.render.volume_rendering import look_up
+from refref_jax.render.model import look_up
 
 CHUNK = 1 << 15
 """Number of points per query."""

@@ -38,7 +38,7 @@ from refref_jax.reconstruct.refractive_index import (
     most_looks,
 )
 from refref_jax.reconstruct.shape_from_refraction import find_index, most_looks_at_backdrop
-from refref_jax.render import checkpoint_io, volume_rendering
+from refref_jax.render import checkpoint_io
 from refref_jax.render.checkpoint_io import SavedModel
 from refref_jax.render.model import Model, ModelConfig, surface_of
 from refref_jax.training import fit, run_folder
@@ -186,7 +186,7 @@ def backdrop_of(folder: Path, model: Model) -> Backdrop | None:
     if model.config.backdrop is None:
         return None
     coverage = run_folder.read_coverage(folder / BACKGROUND)
-    bounds = volume_rendering.domain(model.config)
+    bounds = model.config.domain
     return make_backdrop(bounds, surface_of(model.params), coverage)
 
 

@@ -23,7 +23,7 @@ from refref_jax.data import scene_folder, scene_names
 from refref_jax.geometry.cameras import Cameras
 from refref_jax.optics.scene import Scene
 from refref_jax.render import images as image_rendering
-from refref_jax.render import model, volume_rendering
+from refref_jax.render import model
 from refref_jax.render.model import Model, Params
 from refref_jax.training import backdrop_equations, backdrop_solver, evaluation, presets
 from refref_jax.training.backdrop_equations import Block
@@ -262,7 +262,7 @@ def _trace(
         cameras._replace(poses=cameras.poses[: len(photographs)]),
         photographs,
         settings=settings_,
-        domain=volume_rendering.domain(config),
+        domain=config.domain,
         resolution=resolution,
         most_taps=config.backdrop.most_taps,
         tally=model.path_detail(config, settings_).tally,
@@ -283,7 +283,7 @@ def _solve(
     def solve() -> Params:
         *_, last = backdrop_solver.solve(
             blocks,
-            space=volume_rendering.domain(config).space,
+            space=config.domain.space,
             resolution=resolution,
             iterations=2 * backdrop_solver.ROUND,
             tints=params.tints,

@@ -1,9 +1,9 @@
 """Interface of field kinds: their configurations, functions and arithmetic precision.
 
-A radiance field has two functions, `init_radiance` and `radiance`; a proposal field has
-`init_density` and `density`. All are pure functions over Gaussians in the unit cube. A field kind
-is one module with a `FieldKind`, and one line in `registry`, through which all other modules query
-fields.
+A radiance field has two functions, `init_radiance` and `radiance`, and a third, `blend`, if it has
+sub-spaces; a proposal field has `init_density` and `density`. All are pure functions, most of them
+over Gaussians in the unit cube. A field kind is one module with a `FieldKind`, and one line in
+`registry`, through which all other modules query fields.
 
 The precision is float32, or mixed with bfloat16: tables are then read and matrices multiplied in
 bfloat16, while parameters, sums, gradients and outputs stay in float32. bfloat16 has only 8
@@ -97,6 +97,33 @@ class Radiance(NamedTuple):
     rgb: Float[Array, "3"]
 
 
+class SubSpaces(NamedTuple):
+    """Output of a radiance field that consists of several, which overlap.
+
+    Each sub-space is integrated along the path by itself. What becomes of the features is decided
+    after that, for the whole path, by `FieldKind.blend`: a point alone has no colour.
+
+    Attributes:
+      density: density of each sub-space per scene radius, non-negative.
+      features: features of each sub-space towards the camera.
+    """
+
+    density: Float[Array, " sub_spaces"]
+    features: Float[Array, "sub_spaces channels"]
+
+
+class Blend(NamedTuple):
+    """Colours of the sub-spaces along one path, and their shares.
+
+    Attributes:
+      rgb: linear radiance of each sub-space towards the camera.
+      shares: weight of each sub-space in the colour of the path; they sum to 1.
+    """
+
+    rgb: Float[Array, "sub_spaces 3"]
+    shares: Float[Array, " sub_spaces"]
+
+
 class FieldSize(NamedTuple):
     """Fields of one size, and the numbers of samples along a path.
 
@@ -127,22 +154,26 @@ class FieldKind(NamedTuple):
       radiance_config: configuration class of the radiance field.
       init_radiance: function of key and shape that returns initial radiance field parameters.
       radiance: function of parameters, shape, Gaussians in the unit cube (fractions of its edge)
-        and unit direction of travel (world frame) that returns density and colour of one interval.
+        and unit direction of travel (world frame) that returns density and colour of one interval,
+        or density and features of its sub-spaces.
       density_config: configuration class of the proposal fields.
       init_density: function of key and shape that returns initial proposal field parameters.
       density: function of parameters, shape and Gaussians that returns the density of one interval.
       sizes: field sizes by preset name.
       hash_decay: weight of the hash decay loss.
+      blend: function of parameters, shape and the features of each sub-space, integrated along the
+        path, that returns their colours and shares; `None` if the field has a colour at each point.
     """
 
     radiance_config: type[RadianceConfig]
     init_radiance: Callable[[Array, Any], Params]
-    radiance: Callable[[Params, Any, Gaussians, Float[Array, "3"]], Radiance]
+    radiance: Callable[[Params, Any, Gaussians, Float[Array, "3"]], Radiance | SubSpaces]
     density_config: type[DensityConfig]
     init_density: Callable[[Array, Any], Params]
     density: Callable[[Params, Any, Gaussians], Float[Array, ""]]
     sizes: Mapping[str, FieldSize]
     hash_decay: float
+    blend: Callable[[Params, Any, Float[Array, "sub_spaces channels"]], Blend] | None = None
 
 
 def evaluate(module: nn.Module, params: Params, *inputs: Any) -> Any:

@@ -1,8 +1,9 @@
-"""Multiresolution hash grid: features interpolated from tables at many scales.
+"""Multiresolution hash grid, and the small networks on its features.
 
 Each level covers the unit cube with `n` cells per side. A coarse level stores every grid vertex; a
 fine level hashes its vertices into a table of fixed size. Levels whose cells are finer than the
-queried Gaussian are down-weighted, which anti-aliases the field.
+queried Gaussian are down-weighted, which anti-aliases the field. Several field kinds share the
+networks, which must be called in a compact method of a linen module that owns their layers.
 
 Source: Mueller et al., Instant NGP (2022), section 3; Barron et al., Zip-NeRF (2023), section 2,
 for the down-weighting.
@@ -18,8 +19,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from refref_jax import numerics
-from refref_jax.choices import Precision
+from refref_jax.choices import ColourNetwork, Precision
 from refref_jax.configuration import FORMERLY
+from refref_jax.fields.base import DensityConfig, RadianceConfig, dense
 from refref_jax.fields.hash_grid_kernels import interpolate
 from refref_jax.sampling.polylines import Gaussians
 
@@ -139,3 +141,128 @@ def _initialise(key: Array, shape: tuple[int, int]) -> Float[Array, "entries fea
     return jax.random.uniform(
         key, shape, jnp.float32, minval=-_INITIAL_RANGE, maxval=_INITIAL_RANGE
     )
+
+
+def spherical_harmonics(direction: Float[Array, "3"]) -> Float[Array, "16"]:
+    """Returns the real spherical harmonics of degree 0 to 3 at a unit direction.
+
+    Ordered by degree `l`, then by order `m = -l .. l`; orthonormal over the sphere; without the
+    Condon-Shortley phase.
+
+    Source: paper (arXiv 2505.05848), supplement (direction encoding); Sloan, Stupid Spherical
+    Harmonics Tricks (2008), appendix A2.
+    """
+    x, y, z = direction
+    xx, yy, zz = x * x, y * y, z * z
+    return jnp.stack(
+        [
+            0.28209479177387814 * jnp.ones_like(x),
+            0.4886025119029199 * y,
+            0.4886025119029199 * z,
+            0.4886025119029199 * x,
+            1.0925484305920792 * x * y,
+            1.0925484305920792 * y * z,
+            0.31539156525252005 * (3.0 * zz - 1.0),
+            1.0925484305920792 * x * z,
+            0.5462742152960396 * (xx - yy),
+            0.5900435899266435 * y * (3.0 * xx - yy),
+            2.890611442640554 * x * y * z,
+            0.4570457994644658 * y * (5.0 * zz - 1.0),
+            0.3731763325901154 * z * (5.0 * zz - 3.0),
+            0.4570457994644658 * x * (5.0 * zz - 1.0),
+            1.445305721320277 * z * (xx - yy),
+            0.5900435899266435 * x * (xx - 3.0 * yy),
+        ]
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class GridRadianceConfig(RadianceConfig):
+    """Shape of a radiance field on a hash grid.
+
+    Attributes:
+      grid: shape of the hash grid.
+      density_width: width of the density network's hidden layer.
+      bottleneck: number of features passed from the density network to the colour network.
+      colour_width: width of the colour network's hidden layers.
+      colour_depth: number of hidden layers of the colour network.
+      colour_network: `skip` appends the colour network's inputs to the outputs of its first layer.
+    """
+
+    grid: HashGridConfig
+    density_width: int
+    bottleneck: int
+    colour_width: int
+    colour_depth: int
+    colour_network: ColourNetwork = "plain"
+
+
+@dataclasses.dataclass(frozen=True)
+class GridDensityConfig(DensityConfig):
+    """Shape of a density field on a hash grid.
+
+    Attributes:
+      grid: shape of the hash grid.
+      width: width of the hidden layer.
+    """
+
+    grid: HashGridConfig
+    width: int
+
+
+def nowhere() -> Gaussians:
+    """Returns one point, as an example input for initialising a module."""
+    return Gaussians(jnp.zeros((1, 3), jnp.float32), jnp.zeros(1, jnp.float32))
+
+
+def grid_network(
+    gaussians: Gaussians,
+    grid: HashGridConfig,
+    *,
+    width: int,
+    outputs: int,
+    precision: Precision,
+) -> Float[Array, " outputs"]:
+    """Returns the output of an MLP with one hidden layer on the grid's mean features.
+
+    Args:
+      gaussians: multisamples in the unit cube.
+      grid: shape of the hash grid.
+      width: width of the hidden layer.
+      outputs: number of outputs, without activation.
+      precision: precision of tables and matrix products.
+    """
+    layer = dense(precision)
+    features = MultisampledGrid(grid, precision)(gaussians)
+    # Flax numbers layers in order of creation, and checkpoints contain these names.
+    hidden = nn.relu(layer(width)(features))
+    return layer(outputs)(hidden)
+
+
+def colour(
+    bottleneck: Float[Array, " bottleneck"],
+    direction: Float[Array, "3"],
+    config: GridRadianceConfig,
+) -> Float[Array, "3"]:
+    """Returns a colour in `[0, 1]` from the bottleneck features and a unit direction."""
+    return jax.nn.sigmoid(directional_network(bottleneck, direction, config, outputs=3))
+
+
+def directional_network(
+    bottleneck: Float[Array, " bottleneck"],
+    direction: Float[Array, "3"],
+    config: GridRadianceConfig,
+    *,
+    outputs: int,
+) -> Float[Array, " outputs"]:
+    """Returns the output of the colour network, without activation.
+
+    Source: Zip-NeRF's code in PyTorch, on which the paper's is based, for the skip connection.
+    """
+    layer = dense(config.precision)
+    inputs = hidden = jnp.concatenate([bottleneck, spherical_harmonics(direction)])
+    for i in range(config.colour_depth):
+        hidden = nn.relu(layer(config.colour_width)(hidden))
+        if i == 0 and config.colour_network == "skip":
+            hidden = jnp.concatenate([hidden, inputs])
+    return layer(outputs)(hidden)

@@ -31,10 +31,10 @@ from refref_jax.fields.base import (
     evaluate,
     in_half_precision,
 )
-from refref_jax.fields.hash_grid import HashGridConfig
-from refref_jax.fields.mlps import (
+from refref_jax.fields.hash_grid import (
     GridDensityConfig,
     GridRadianceConfig,
+    HashGridConfig,
     colour,
     grid_network,
     nowhere,

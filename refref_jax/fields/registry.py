@@ -8,20 +8,23 @@ from collections.abc import Mapping
 
 from jaxtyping import Array, Float
 
-from refref_jax.fields import nerfacto, zipnerf
+from refref_jax.fields import msnerf, nerfacto, zipnerf
 from refref_jax.fields.base import (
+    Blend,
     DensityConfig,
     FieldConfig,
     FieldKind,
     Params,
     Radiance,
     RadianceConfig,
+    SubSpaces,
 )
 from refref_jax.sampling.polylines import Gaussians
 
 KINDS: dict[str, FieldKind] = {
     "zipnerf": zipnerf.KIND,
     "nerfacto": nerfacto.KIND,
+    "msnerf": msnerf.KIND,
 }
 
 USUAL = "zipnerf"
@@ -35,9 +38,23 @@ def init_radiance(key: Array, config: RadianceConfig) -> Params:
 
 def radiance(
     params: Params, config: RadianceConfig, gaussians: Gaussians, direction: Float[Array, "3"]
-) -> Radiance:
-    """Returns density and colour of one interval of a path; see `FieldKind`."""
+) -> Radiance | SubSpaces:
+    """Returns density and colour, or sub-spaces, of one interval of a path; see `FieldKind`."""
     return KINDS[config.kind].radiance(params, config, gaussians, direction)
+
+
+def blend(
+    params: Params, config: RadianceConfig, features: Float[Array, "sub_spaces channels"]
+) -> Blend:
+    """Returns colours and shares of the sub-spaces along a path; see `FieldKind`."""
+    blended = KINDS[config.kind].blend
+    assert blended is not None, config.kind
+    return blended(params, config, features)
+
+
+def has_sub_spaces(config: RadianceConfig) -> bool:
+    """Returns whether a field has sub-spaces, so that only whole paths have a colour."""
+    return KINDS[config.kind].blend is not None
 
 
 def init_density(key: Array, config: DensityConfig) -> Params:

@@ -26,10 +26,10 @@ from refref_jax.fields.base import (
     evaluate,
     in_half_precision,
 )
-from refref_jax.fields.hash_grid import HashGridConfig
-from refref_jax.fields.mlps import (
+from refref_jax.fields.hash_grid import (
     GridDensityConfig,
     GridRadianceConfig,
+    HashGridConfig,
     colour,
     grid_network,
     nowhere,
@@ -50,12 +50,12 @@ class DensityFieldConfig(GridDensityConfig):
     kind: Literal["zipnerf"] = dataclasses.field(default="zipnerf", kw_only=True)
 
 
-def init_density(key: Array, config: DensityFieldConfig) -> Params:
+def init_density(key: Array, config: GridDensityConfig) -> Params:
     """Returns initial parameters."""
     return _DensityField(config).init(key, nowhere())
 
 
-def density(params: Params, config: DensityFieldConfig, gaussians: Gaussians) -> Float[Array, ""]:
+def density(params: Params, config: GridDensityConfig, gaussians: Gaussians) -> Float[Array, ""]:
     """Returns the density of one interval, averaged over its multisamples, per scene radius.
 
     Args:
@@ -66,13 +66,18 @@ def density(params: Params, config: DensityFieldConfig, gaussians: Gaussians) ->
     return evaluate(_DensityField(config), params, gaussians)
 
 
-def activate_density(raw: Float[Array, ""]) -> Float[Array, ""]:
+def activate_density(raw: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """Returns the density for a network output: a shifted softplus, linear for large inputs."""
     return jax.nn.softplus(raw + _DENSITY_SHIFT)
 
 
+def pad_colour(rgb: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """Widens the range of colours from `[0, 1]` to `[-0.001, 1.001]`."""
+    return rgb * (1.0 + 2.0 * _COLOUR_PADDING) - _COLOUR_PADDING
+
+
 class _DensityField(nn.Module):
-    config: DensityFieldConfig
+    config: GridDensityConfig
 
     @nn.compact
     def __call__(self, gaussians: Gaussians) -> Float[Array, ""]:
@@ -126,7 +131,7 @@ class _RadianceField(nn.Module):
             precision=config.precision,
         )
         rgb = colour(raw[1:], direction, config)
-        padded = rgb * (1.0 + 2.0 * _COLOUR_PADDING) - _COLOUR_PADDING
+        padded = pad_colour(rgb)
         return Radiance(activate_density(raw[0]), padded)
 
 

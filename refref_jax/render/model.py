@@ -1,7 +1,9 @@
 """Model of a scene: static configuration, learned parameters, scene and path settings.
 
 The static configuration holds the fields, their sampling, and the scene bounds. It is hashable, so
-compiled functions take it as a static argument.
+compiled functions take it as a static argument. `look_up` queries the field of a model at world
+points, without light paths, to export surfaces and point clouds; the field inside objects is
+meaningless if the model takes no samples there.
 """
 
 import dataclasses
@@ -9,7 +11,8 @@ import math
 from typing import NamedTuple, get_args
 
 import jax
-from jaxtyping import Array
+import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from refref_jax.choices import (
     ORIGIN,
@@ -22,12 +25,14 @@ from refref_jax.choices import (
     ViewDependence,
 )
 from refref_jax.fields import base, registry
-from refref_jax.fields.base import DensityConfig, RadianceConfig
+from refref_jax.fields.base import DensityConfig, Radiance, RadianceConfig
 from refref_jax.optics.path_settings import Detail, PathSettings, Tally
 from refref_jax.optics.scene import Scene
 from refref_jax.render import backdrop, learned_media
 from refref_jax.render.backdrop import Pyramid
 from refref_jax.render.learned_media import LearnedTints
+from refref_jax.sampling import scene_bounds
+from refref_jax.sampling.polylines import Gaussians
 
 # Segments before and after a convex object.
 _CONVEX_LEGS = 2
@@ -129,6 +134,11 @@ class ModelConfig:
     centre: Position = ORIGIN
     backdrop: BackdropConfig | None = None
     last_sample: LastSample = "middle"
+
+    @property
+    def domain(self) -> scene_bounds.Domain:
+        """The scene bounds."""
+        return scene_bounds.Domain(self.radius, self.space, self.centre)
 
     def __post_init__(self) -> None:
         """Validates the values."""
@@ -239,3 +249,56 @@ def has_foreground(config: ModelConfig) -> bool:
 def surface_of(params: Params) -> Pyramid:
     """Returns the radiance of a backdrop."""
     return params.field.backdrop if isinstance(params.field, Layers) else params.field
+
+
+class FieldPoint(NamedTuple):
+    """Values of the field at a point.
+
+    Attributes:
+      density: density per world unit, non-negative: the transmittance of a short distance `dt` is
+        `exp(-density dt)`.
+      linear: linear RGB radiance, opposite to the direction of travel.
+    """
+
+    density: Float[Array, ""]
+    linear: Float[Array, "3"]
+
+
+def look_up(
+    params: Params,
+    config: ModelConfig,
+    point: Float[Array, "3"],
+    direction: Float[Array, "3"],
+    *,
+    width: float,
+) -> FieldPoint:
+    """Returns density and colour at one point; map it over many.
+
+    Args:
+      params: parameters of the model.
+      config: configuration of the model.
+      point: position in world units; beyond the scene bounds, their nearest point is used.
+      direction: unit direction of travel of the viewing path.
+      width: edge of the cell around the point, world units: finer detail is blurred.
+
+    Raises:
+      ValueError: if the model has a backdrop instead of fields, or its field has sub-spaces.
+    """
+    if config.backdrop is not None:
+        raise ValueError(
+            "This model has a backdrop in place of a field, so there is no density to look up. "
+            "Train it with far_field=field."
+        )
+    if registry.has_sub_spaces(config.field):
+        raise ValueError(
+            f"A point has no colour in fields of kind {config.field.kind}, which blends sub-spaces "
+            "along whole paths. Train with field=zipnerf."
+        )
+    # Standard deviation of a cube along each axis.
+    scale = jnp.full((1,), width, point.dtype) / jnp.sqrt(jnp.asarray(12.0, point.dtype))
+    bounds = config.domain
+    held = scene_bounds.nearest_within(bounds, point)
+    cell = scene_bounds.to_unit_cube(bounds, Gaussians(held[None], scale))
+    seen = registry.radiance(params.field, config.field, cell, direction)
+    assert isinstance(seen, Radiance)
+    return FieldPoint(seen.density / config.radius, seen.rgb)

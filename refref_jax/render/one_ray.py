@@ -34,11 +34,16 @@ def render_ray(model: Model, ray: Rays) -> Float[Array, "3"]:
       ray: one camera ray, without leading axes.
 
     Raises:
-      ValueError: if the model has a backdrop instead of fields.
+      ValueError: if the model has a backdrop instead of fields, or its field has sub-spaces.
     """
     config, params = model.config, model.params
     if config.backdrop is not None:
         raise ValueError("This page shows fields, but the model has a backdrop. Use render_rays.")
+    if registry.has_sub_spaces(config.field):
+        raise ValueError(
+            f"This page shows fields with one colour at a point, but the field is of kind "
+            f"{config.field.kind}. Use render_rays."
+        )
     density = jax.vmap(registry.density, in_axes=(None, None, 0))
     radiance = jax.vmap(registry.radiance, in_axes=(None, None, 0, 0))
     middle = functools.partial(

@@ -27,7 +27,7 @@ from refref_jax.optics import path_tracing
 from refref_jax.optics.light_paths import LightPaths, PathStatus
 from refref_jax.optics.path_settings import Detail, PathSettings, Tally
 from refref_jax.optics.scene import Scene
-from refref_jax.render import Model, learned_media, volume_rendering
+from refref_jax.render import Model, learned_media
 from refref_jax.render.learned_media import LearnedTints
 from refref_jax.sampling import scene_bounds
 from refref_jax.sampling.scene_bounds import Domain
@@ -107,7 +107,7 @@ def trace_pixel(
     """
     colours = domain = None
     if isinstance(scene, Model):
-        colours, domain = scene.params.tints, volume_rendering.domain(scene.config)
+        colours, domain = scene.params.tints, scene.config.domain
         settings = settings or scene.settings
         scene = scene.scene
     if settings is None:

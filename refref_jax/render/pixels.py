@@ -113,7 +113,7 @@ def render_paths(
 def _see_backdrop(params: Params, config: ModelConfig, paths: LightPaths) -> Composite:
     """Returns what each path sees of the backdrop, at the distance where it ends there."""
     assert config.backdrop is not None
-    ends, bounds = light_paths.ends_of(paths), volume_rendering.domain(config)
+    ends, bounds = light_paths.ends_of(paths), config.domain
     resolution, count = config.backdrop.resolution, paths.radii.shape[0]
     alone = ends._replace(throughput=jnp.ones_like(ends.throughput))
     lookups = backdrop.locate(

@@ -4,16 +4,15 @@ Symbols, as in the paper (arXiv 2505.05848, section 4.1): interval `i` has densi
 length `delta_i`; `T_i = exp(-sum_{j<i} sigma_j delta_j)` is the light that reaches it and
 `w_i = T_i (1 - exp(-sigma_i delta_i))` its weight in the colour.
 
-All functions of paths take one path; `pixels` maps them over a batch. `look_up` queries the fields
-of a model at world points, without light paths, to export surfaces and point clouds; the field
-inside objects is meaningless if the model takes no samples there.
+All functions take one path; `pixels` maps them over a batch.
 
 Source: Barron et al., Mip-NeRF 360 (2022), section 3, and Zip-NeRF (2023); paper (arXiv
 2505.05848), section 4.2, for samples and directions on the bent path.
 """
 
+import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -23,7 +22,7 @@ from jaxtyping import Array, Bool, Float
 from refref_jax import numerics
 from refref_jax.choices import LastSample
 from refref_jax.fields import base, registry
-from refref_jax.fields.base import Radiance
+from refref_jax.fields.base import Radiance, SubSpaces
 from refref_jax.optics.light_paths import LightPaths
 from refref_jax.render.model import Layers, ModelConfig, Params
 from refref_jax.sampling import polylines, scene_bounds, stepfun
@@ -189,8 +188,8 @@ def path_radiance(
     line = polyline(config, path)
     warp = distance_warp(config, line)
     samples, seen, histograms = _sampled(params, config, line, warp, jitter, anneal)
-    weights = _weigh(config, seen.density, samples.t)
-    composited = composite(weights, seen.rgb, samples.t, last_sample=_last_sample(config))
+    weigh = functools.partial(_weigh, config, edges=samples.t)
+    weights, composited = integrate(params, config, seen, samples.t, weigh=weigh)
     return PathRadiance(
         composite=_in_arc_length(line, composited),
         histograms=(*histograms, Histogram(samples.s, weights)),
@@ -221,8 +220,12 @@ def foreground_radiance(
         far = jnp.maximum(length, _SHORTEST * config.radius)
         warp = scene_bounds.DistanceWarp(0.0, far, config.radius)
         samples, seen, proposed = _sampled(params, config, line, warp, jitter, anneal)
-        weights = jnp.where(length > 0.0, _weigh(config, seen.density, samples.t), 0.0)
-        front = _in_arc_length(line, composite(weights, seen.rgb, samples.t))
+
+        def weigh(density: Array) -> Array:
+            return jnp.where(length > 0.0, _weigh(config, density, samples.t), 0.0)
+
+        weights, front = integrate(params, config, seen, samples.t, weigh=weigh)
+        front = _in_arc_length(line, front)
         histograms = (*proposed, Histogram(samples.s, weights))
         outside = samples.points.outside
     if path.stop is not None:
@@ -231,6 +234,41 @@ def foreground_radiance(
         closed = in_front_of(front, rgb, stop)
         front = jax.tree.map(lambda x, y: jnp.where(jnp.isfinite(stop), x, y), closed, front)
     return PathRadiance(front, histograms, outside)
+
+
+def integrate(
+    params: Params,
+    config: ModelConfig,
+    seen: Radiance | SubSpaces,
+    edges: Float[Array, " edges"],
+    *,
+    weigh: Callable[[Array], Array],
+) -> tuple[Float[Array, " samples"], Composite]:
+    """Returns the weights of the intervals, and colour and distances of the path.
+
+    Sub-spaces are weighed and integrated each by itself, decoded, and blended by their shares, in
+    colour and weights. As much light passes through one as its own weights are short of 1.
+
+    Args:
+      params: parameters of the model.
+      config: configuration of the model.
+      seen: what the field returned for each interval.
+      edges: distances of the edges of the intervals.
+      weigh: function of the densities of all intervals that returns their weights.
+
+    Source: Yin et al., Multi-Space Neural Radiance Fields (2023), section 3, for sub-spaces.
+    """
+    last_sample = _last_sample(config)
+    if isinstance(seen, Radiance):
+        weights = weigh(seen.density)
+        return weights, composite(weights, seen.rgb, edges, last_sample=last_sample)
+    each = jax.vmap(weigh, in_axes=-1, out_axes=-1)(seen.density)
+    features = jnp.sum(each[..., None] * seen.features, axis=0)
+    blend = registry.blend(_field_of(params), config.field, features)
+    weights = jnp.sum(each * blend.shares[None], axis=-1)
+    rgb = jnp.sum((blend.shares * jnp.sum(each, axis=0))[:, None] * blend.rgb, axis=0)
+    composited = composite(weights, jnp.zeros((*weights.shape, 3)), edges, last_sample=last_sample)
+    return weights, composited._replace(rgb=rgb)
 
 
 def in_front_of(front: Composite, rgb: Float[Array, "3"], distance: Float[Array, ""]) -> Composite:
@@ -256,9 +294,13 @@ def _opaque_surface(params: Params, config: ModelConfig, whole: Polyline) -> Flo
     assert whole.stop is not None
     at = jnp.where(jnp.isfinite(whole.stop), whole.stop, 0.0)
     cone = polylines.multisamples(whole, at, at, jnp.zeros_like(at), count=config.multisamples)
-    cell = scene_bounds.to_unit_cube(domain(config), cone)
+    cell = scene_bounds.to_unit_cube(config.domain, cone)
     direction = polylines.point_at(whole, at).direction
-    return registry.radiance(_field_of(params), config.field, cell, direction).rgb
+    seen = registry.radiance(_field_of(params), config.field, cell, direction)
+    if isinstance(seen, Radiance):
+        return seen.rgb
+    blend = registry.blend(_field_of(params), config.field, seen.features)
+    return jnp.sum(blend.shares[:, None] * blend.rgb, axis=0)
 
 
 def _field_of(params: Params) -> base.Params:
@@ -272,7 +314,7 @@ def _sampled(
     warp: scene_bounds.DistanceWarp,
     jitter: Jitter,
     anneal: Float[Array, ""],
-) -> tuple[Samples, Radiance, list[Histogram]]:
+) -> tuple[Samples, Radiance | SubSpaces, list[Histogram]]:
     """Returns the final samples, what the field returns there, and the proposals' histograms."""
 
     def drawn(level: int, count: int) -> Samples:
@@ -306,18 +348,13 @@ def distance_warp(config: ModelConfig, line: Polyline) -> scene_bounds.DistanceW
     background.
     """
     last = jnp.sum(jnp.isfinite(line.knots)) - 1
-    leave = scene_bounds.exit_distance(domain(config), line.points[last], line.directions[last])
+    leave = scene_bounds.exit_distance(config.domain, line.points[last], line.directions[last])
     far = line.knots[last] + jnp.where(jnp.isfinite(leave), leave, config.far)
     if line.stop is not None:
         far = jnp.where(jnp.isfinite(line.stop), line.stop, far)
     # Keep a minimum length for samples even if the camera is on the scene bounds.
     far = jnp.maximum(far, config.near + _SHORTEST * config.radius)
     return scene_bounds.DistanceWarp(config.near, far, config.radius)
-
-
-def domain(config: ModelConfig) -> scene_bounds.Domain:
-    """Returns the scene bounds of a model."""
-    return scene_bounds.Domain(config.radius, config.space, config.centre)
 
 
 def polyline(config: ModelConfig, path: LightPaths) -> Polyline:
@@ -368,7 +405,7 @@ def sample(
 
     def cone(start: Array, end: Array, turn: Array) -> Gaussians:
         world = polylines.multisamples(line, start, end, turn, count=config.multisamples)
-        return scene_bounds.to_unit_cube(domain(config), world)
+        return scene_bounds.to_unit_cube(config.domain, world)
 
     return Samples(s, t, jax.vmap(cone)(starts, ends, turns), points)
 
@@ -418,50 +455,3 @@ def _in_arc_length(line: Polyline, composite: Composite) -> Composite:
     arc = jax.vmap(lambda t: polylines.point_at(line, t).arc)
     median, mean = arc(jnp.stack([composite.median, composite.mean]))
     return composite._replace(median=median, mean=mean)
-
-
-class FieldPoint(NamedTuple):
-    """Values of the field at a point.
-
-    Attributes:
-      density: density per world unit, non-negative: the transmittance of a short distance `dt` is
-        `exp(-density dt)`.
-      linear: linear RGB radiance, opposite to the direction of travel.
-    """
-
-    density: Float[Array, ""]
-    linear: Float[Array, "3"]
-
-
-def look_up(
-    params: Params,
-    config: ModelConfig,
-    point: Float[Array, "3"],
-    direction: Float[Array, "3"],
-    *,
-    width: float,
-) -> FieldPoint:
-    """Returns density and colour at one point; map it over many.
-
-    Args:
-      params: parameters of the model.
-      config: configuration of the model.
-      point: position in world units; beyond the scene bounds, their nearest point is used.
-      direction: unit direction of travel of the viewing path.
-      width: edge of the cell around the point, world units: finer detail is blurred.
-
-    Raises:
-      ValueError: if the model has a backdrop instead of fields.
-    """
-    if config.backdrop is not None:
-        raise ValueError(
-            "This model has a backdrop in place of a field, so there is no density to look up. "
-            "Train it with far_field=field."
-        )
-    # Standard deviation of a cube along each axis.
-    scale = jnp.full((1,), width, point.dtype) / jnp.sqrt(jnp.asarray(12.0, point.dtype))
-    bounds = domain(config)
-    held = scene_bounds.nearest_within(bounds, point)
-    cell = scene_bounds.to_unit_cube(bounds, Gaussians(held[None], scale))
-    seen = registry.radiance(params.field, config.field, cell, direction)
-    return FieldPoint(seen.density / config.radius, seen.rgb)

@@ -19,7 +19,7 @@ from refref_jax import configuration
 from refref_jax.data import image_files, scene_folder
 from refref_jax.data.scene_folder import Frames
 from refref_jax.optics.scene import Scene
-from refref_jax.render import backdrop, pixels, volume_rendering
+from refref_jax.render import backdrop, pixels
 from refref_jax.render.backdrop import Pyramid
 from refref_jax.render.checkpoint_io import SavedModel
 from refref_jax.render.model import Params, init_params, path_detail, surface_of
@@ -104,7 +104,7 @@ class _Problem(NamedTuple):
             self.frames.cameras,
             self.images,
             settings=self.model.settings,
-            domain=volume_rendering.domain(self.model.config),
+            domain=self.model.config.domain,
             resolution=shape.resolution,
             most_taps=shape.most_taps,
             axes=shape.axes,

@@ -30,7 +30,7 @@ FIELD_ONLY = (
     *("log2_hashmap_size", "max_res", "precision", "colour_network", "contraction", "near", "far"),
     *("data_loss", "interlevel_weight", "blurs", "distortion_weight", "hash_decay", "distortion"),
     *("path_losses", "steps", "warmup", "learning_rate", "final_learning_rate", "anneal", "batch"),
-    *("pretraced_batches", "adam_b2"),
+    *("pretraced_batches", "adam_b2", "sub_spaces"),
 )
 """Options that only a radiance field reads."""
 
@@ -55,7 +55,7 @@ _SAMPLES = ("preset", "field", "background", "paths", "interior", "contraction",
 # Maximum number of steps, rays and batches, which are 32-bit integers.
 _MOST = 2**31 - 1
 
-_FINEST, _CELLS, _SEEDS = 2**20, 2**13, 2**32
+_FINEST, _CELLS, _SEEDS, _MOST_SUB_SPACES = 2**20, 2**13, 2**32, 64
 
 # Numbers of multisamples of the patterns in `sampling.polylines`.
 _PATTERNS = (1, 6)
@@ -157,7 +157,8 @@ class FieldConfig:
 
     Attributes:
       preset: Size of the model and length of its training.
-      field: Field kind: zipnerf, or nerfacto, which has no anti-aliasing.
+      field: Field kind: zipnerf; nerfacto, without anti-aliasing; or msnerf, with sub-spaces.
+      sub_spaces: Number of sub-spaces, only of field=msnerf.
       interior: Model of the inside of the objects: a learned field (the paper), empty (clear), or
         interfaces and media that absorb light (absorbing). By default clear if all objects are
         clear in scene.json, else absorbing.
@@ -197,6 +198,7 @@ class FieldConfig:
 
     preset: choices.PresetName = option("tiny")
     field: choices.FieldName = option("zipnerf")
+    sub_spaces: int | None = option(None, after=("preset", "field"))
     interior: choices.Interior | None = option(
         None, after=(*_OBJECTS, "paths", "max_bends", "tints")
     )
@@ -236,7 +238,8 @@ class FieldConfig:
         if self.max_res is not None and not 1 <= self.max_res <= _FINEST:
             raise ValueError(f"max_res is {self.max_res}. Give 1 to {_FINEST} cells per side.")
         ranges = {"backdrop_resolution": (4, _CELLS), "iterations": (1, _FINEST)}
-        for name, (least, most) in {**ranges, "most_pixels": (1, _MOST)}.items():
+        ranges |= {"most_pixels": (1, _MOST), "sub_spaces": (1, _MOST_SUB_SPACES)}
+        for name, (least, most) in ranges.items():
             number = getattr(self, name)
             if number is not None and not least <= number <= most:
                 raise ValueError(f"{name} is {number}. Give {least} to {most}.")

@@ -42,7 +42,7 @@ from typing import Any
 import numpy as np
 
 from refref_jax.choices import ORIGIN, InFront, Interior, Position, Space
-from refref_jax.fields import mlps, registry
+from refref_jax.fields import hash_grid, msnerf, registry
 from refref_jax.fields.base import RadianceConfig
 from refref_jax.fields.hash_grid import HashGridConfig
 from refref_jax.geometry.cameras import Cameras
@@ -223,9 +223,9 @@ def override_model(
         )
         field = dataclasses.replace(model.field, precision=asked.precision)
         model = dataclasses.replace(model, proposals=proposals, field=field)
-    field = _with_grid(model.field, asked)
+    field = _with_sub_spaces(_with_grid(model.field, asked), asked.sub_spaces)
     if asked.colour_network != "plain":
-        if not isinstance(field, mlps.GridRadianceConfig):
+        if not isinstance(field, hash_grid.GridRadianceConfig):
             raise ValueError(
                 f"colour_network={asked.colour_network} is an option of field kinds with a hash "
                 f"grid, unlike {field.kind}. Leave it out."
@@ -252,7 +252,7 @@ def _with_samples(model: ModelConfig, samples: tuple[int, ...], preset: str) -> 
 def _with_grid(field: RadianceConfig, asked: FieldConfig) -> RadianceConfig:
     if asked.log2_hashmap_size is None and asked.max_res is None:
         return field
-    if not isinstance(field, mlps.GridRadianceConfig):
+    if not isinstance(field, hash_grid.GridRadianceConfig):
         raise ValueError(
             "log2_hashmap_size and max_res are options of a hash grid, which field kind "
             f"{field.kind} does not have. Leave them out."
@@ -270,6 +270,17 @@ def _with_grid(field: RadianceConfig, asked: FieldConfig) -> RadianceConfig:
     return dataclasses.replace(field, grid=grid)
 
 
+def _with_sub_spaces(field: RadianceConfig, count: int | None) -> RadianceConfig:
+    if count is None:
+        return field
+    if not isinstance(field, msnerf.MsnerfConfig):
+        raise ValueError(
+            f"sub_spaces={count} has no effect on field kind {field.kind}. Leave it out, or use "
+            "field=msnerf."
+        )
+    return dataclasses.replace(field, sub_spaces=count)
+
+
 def samples_of(model: ModelConfig) -> tuple[int, ...]:
     """Returns the number of samples of each proposal level, then of the radiance field."""
     return (*(proposal.samples for proposal in model.proposals), model.samples)
@@ -277,12 +288,12 @@ def samples_of(model: ModelConfig) -> tuple[int, ...]:
 
 def grid_of(model: ModelConfig) -> HashGridConfig | None:
     """Returns the hash grid of a model's radiance field, if its field kind has one."""
-    return model.field.grid if isinstance(model.field, mlps.GridRadianceConfig) else None
+    return model.field.grid if isinstance(model.field, hash_grid.GridRadianceConfig) else None
 
 
 def sampling_of(model: ModelConfig) -> dict[str, Any]:
     """Returns the options of a model's samples, grid and precision, by name."""
-    grid = grid_of(model)
+    grid, field = grid_of(model), model.field
     return {
         "footprint": model.footprint,
         "samples_per_ray": samples_of(model),
@@ -291,6 +302,7 @@ def sampling_of(model: ModelConfig) -> dict[str, Any]:
         "max_res": grid and grid.max_res,
         "precision": model.field.precision,
         "dilation": model.dilation,
+        "sub_spaces": field.sub_spaces if isinstance(field, msnerf.MsnerfConfig) else None,
     }
 
 

@@ -12,7 +12,7 @@ from refref_jax.fields import registry
 from refref_jax.fields.base import Radiance
 from refref_jax.optics.light_paths import Stop
 from refref_jax.render import pixels, volume_rendering
-from refref_jax.render.model import Params, init_params
+from refref_jax.render.model import Params, init_params, look_up
 from refref_jax.render.volume_rendering import Jitter
 from refref_jax.sampling import polylines, scene_bounds
 from tests.factories import made_paths
@@ -467,7 +467,7 @@ def test_samples_gradients_and_lookups_of_a_moved_model_are_the_same(space):
 
         def density(params, config=config, shift=shift):
             point, towards = jnp.array([1.0, 2.0, -3.0]) + shift, jnp.array([0.0, 0.0, 1.0])
-            return volume_rendering.look_up(params, config, point, towards, width=0.1).density
+            return look_up(params, config, point, towards, width=0.1).density
 
         gradient = jax.grad(density)(_params(usual))
         results.append((found.gaussians, found.t, gradient.field, density(_params(usual))))

@@ -13,7 +13,7 @@ import trimesh
 from refref_jax.data import scene_folder
 from refref_jax.geometry.cameras import image_rays
 from refref_jax.render import Model, one_ray, render_image, render_rays
-from refref_jax.render.volume_rendering import look_up
+from refref_jax.render.model import look_up
 from refref_jax.training import backdrop_solver, run_folder
 from refref_jax.training.config import TrainConfig
 from refref_jax.training.fit import Periods, fit, prepare

@@ -26,7 +26,10 @@ pytestmark = [pytest.mark.loose, pytest.mark.longest]
 _ADDED_SINCE = {
     "config.json": [
         ("scene", "shading"),
-        *(("model", name) for name in ("colour_network", "contraction", "near", "far")),
+        *(
+            ("model", name)
+            for name in ("colour_network", "contraction", "near", "far", "sub_spaces")
+        ),
         ("losses", "path_losses"),
         ("schedule", "adam_b2"),
     ],

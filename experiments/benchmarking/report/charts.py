@@ -41,27 +41,30 @@ def look(method: str) -> Line:
     """Returns the line style of a method.
 
     An ablation never has the colour of its reference method, and is dashed once the colours of its
-    group are used up. External methods, which have no curves, share one style.
+    group are used up. Baselines are dashed, since the main methods, in the same charts, are not.
+    External methods, which have no curves, share one style.
     """
     if method not in METHODS:
         return Line(len(COLOURS) - 1, _DASHES[-1])
     if method in _MAIN:
         return Line(_MAIN.index(method), None)
     group = METHODS[method].group
+    place = [name for name in METHODS if METHODS[name].group == group].index(method)
+    if group not in FULL:
+        return Line(place % len(COLOURS), _DASHES[1])
     full = look(FULL[group])
     free = [i for i in range(len(COLOURS)) if i != full.colour]
-    place = [name for name in METHODS if METHODS[name].group == group].index(method)
     return Line(free[place % len(free)], _DASHES[place // len(free)])
 
 
 def families(methods: Sequence[str]) -> list[list[str]]:
-    """Groups methods by chart: the main ones, and each kind of ablation.
+    """Groups methods by chart: those that are no ablations, and each kind of ablation.
 
     Args:
       methods: names of all methods, in order.
     """
     groups = {name: METHODS[name].group if name in METHODS else "main" for name in methods}
-    found = [[name for name in methods if groups[name] == "main"]]
+    found = [[name for name in methods if groups[name] not in FULL]]
     for kind, full in FULL.items():
         if kind in groups.values():
             found.append([name for name in methods if name == full or groups[name] == kind])

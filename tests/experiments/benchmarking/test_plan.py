@@ -58,6 +58,10 @@ def test_methods_are_in_the_order_of_the_table_and_none_hides_a_reconstruction()
         "tree",
     ]
     assert {method.name for method in methods.parse(["all"])} == set(METHODS)
+    (baseline,) = methods.parse(["baselines"])
+    assert baseline.name == "msnerf" and not baseline.requires
+    for group in ("main", "ablations"):
+        assert baseline not in methods.parse([group])
     assert {"oracle", "tree"} < {method.name for method in methods.parse(["ablations"])}
     assert RECONSTRUCTION not in METHODS
     assert METHODS["oracle_no_tir"].train == ("--paths=paper_no_tir", "--interior=field")

@@ -12,7 +12,7 @@ from PIL import Image as Picture
 
 from experiments.benchmarking import plan, summary
 from experiments.benchmarking.methods import METHODS
-from experiments.benchmarking.report import data, images, page, sheets
+from experiments.benchmarking.report import charts, data, images, page, sheets
 from experiments.benchmarking.report.data import Result, Scene
 from experiments.benchmarking.results import Image, Truth, View
 from tests.factories.made_benchmark import QUALITY, made_record, write_benchmark
@@ -251,3 +251,11 @@ def test_distances_share_the_scale_of_the_true_ones():
     assert images.distance_scale(None, [nowhere]) is None
     flat = images.distance_scale(np.full((2, 2), 3.0, np.float32), [])
     assert flat.high > flat.low == 3.0
+
+
+def test_the_methods_of_a_chart_look_different():
+    together = charts.families([*METHODS, "external"])
+    assert {name for names in together for name in names} == {*METHODS, "external"}
+    assert {"straight", "msnerf", "tree", "external"} <= set(together[0])
+    for names in together:
+        assert len({charts.look(name) for name in names}) == len(names)

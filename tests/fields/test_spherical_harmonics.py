@@ -3,14 +3,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from refref_jax.fields import mlps
+from refref_jax.fields import hash_grid
 from tests.laws import gradients, transformations
 from tests.oracles import reference_sampling
 
 # Cubic polynomials of float32 components.
 _POLYNOMIAL = 2e-6
 
-_encode = jax.jit(jax.vmap(mlps.spherical_harmonics))
+_encode = jax.jit(jax.vmap(hash_grid.spherical_harmonics))
 
 
 def _directions(count=50):
@@ -23,7 +23,7 @@ def test_spherical_harmonics_by_hand():
     # Sloan's table at the pole: only the orders 0 are not zero there, sqrt((2 l + 1) / (4 pi)).
     expected = np.zeros(16)
     expected[[0, 2, 6, 12]] = np.sqrt(np.array([1.0, 3.0, 5.0, 7.0]) / (4.0 * np.pi))
-    got = mlps.spherical_harmonics(jnp.array([0.0, 0.0, 1.0]))
+    got = hash_grid.spherical_harmonics(jnp.array([0.0, 0.0, 1.0]))
     np.testing.assert_allclose(got, expected, atol=_POLYNOMIAL)
 
 
@@ -36,15 +36,15 @@ def test_spherical_harmonics_against_scipy():
 
 
 def test_the_zero_vector_is_finite():
-    functions = mlps.spherical_harmonics, jax.jacrev(mlps.spherical_harmonics)
+    functions = hash_grid.spherical_harmonics, jax.jacrev(hash_grid.spherical_harmonics)
     assert gradients.all_finite([jax.jit(function)(jnp.zeros(3)) for function in functions])
 
 
 def test_spherical_harmonics_check_grads():
-    gradients.assert_numerical(mlps.spherical_harmonics, _directions()[-1])
+    gradients.assert_numerical(hash_grid.spherical_harmonics, _directions()[-1])
 
 
 @pytest.mark.parametrize("transformation", transformations.ALL)
 def test_transformations_change_nothing(transformation):
     directions = jnp.asarray(_directions()[:8], jnp.float32)
-    transformation(mlps.spherical_harmonics, (directions,))
+    transformation(hash_grid.spherical_harmonics, (directions,))
