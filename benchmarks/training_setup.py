@@ -4,12 +4,10 @@ from pathlib import Path
 
 from jax.sharding import Mesh
 
-from refref_jax.data import scene_folder
-from refref_jax.data.batches import PixelSampler
 from refref_jax.fields import registry
 from refref_jax.training import devices, loop
 from refref_jax.training.config import TrainConfig
-from refref_jax.training.fit import prepare
+from refref_jax.training.fit import prepare, read_pixels
 from refref_jax.training.loop import PretracedBatches, TrainState, init_state
 
 
@@ -36,7 +34,7 @@ def set_up_training(
         scene=str(scene), preset=preset, paths=paths, samples_per_ray=samples
     )
     (config, model, *_), objects = prepare(asked)
-    pixels = sampler_of(config)
+    pixels = read_pixels(config, scene)
     setup = loop.set_up(config, model.config, model.settings, objects, pixels, mesh=mesh)
     state = init_state(config.seed, model.config, config.schedule)
     return setup, devices.put_everywhere(state, mesh=mesh)
@@ -45,13 +43,6 @@ def set_up_training(
 def usual_samples(preset: str) -> tuple[int, ...]:
     """Returns the samples of each level of a preset, where walls are not the only thing seen."""
     return registry.KINDS[registry.USUAL].sizes[preset].samples
-
-
-def sampler_of(config: TrainConfig) -> PixelSampler:
-    """Returns the training pixels of a resolved configuration."""
-    frames = scene_folder.read_frames(Path(config.scene.path), "train")
-    images = scene_folder.read_images(frames)
-    return PixelSampler(images, frames.cameras, seed=config.seed, batch=config.schedule.batch)
 
 
 def pretrace(setup: loop.Setup) -> PretracedBatches:

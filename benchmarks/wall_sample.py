@@ -14,16 +14,17 @@ times hold when the machine's speed drifts. Asserted is that with few samples th
 import dataclasses
 import itertools
 import time
+from pathlib import Path
 
 import jax
 import numpy as np
 from absl import app, flags
 
-from benchmarks.training_setup import sampler_of, usual_samples
+from benchmarks.training_setup import usual_samples
 from refref_jax.render.model import Model
 from refref_jax.training import evaluation, loop
 from refref_jax.training.config import TrainConfig
-from refref_jax.training.fit import prepare
+from refref_jax.training.fit import prepare, read_pixels
 
 _SCENE = flags.DEFINE_string("scene", "experiments/data/cube_smcvx_ball", "Folder of the scene.")
 _PRESET = flags.DEFINE_string("preset", "tiny", "Preset of all models.")
@@ -86,7 +87,8 @@ def _set_up(seed: int) -> loop.Setup:
         seed=seed,
     )
     (config, model, *_), objects = prepare(asked, report=lambda line: None)
-    return loop.set_up(config, model.config, model.settings, objects, sampler_of(config))
+    pixels = read_pixels(config, Path(config.scene.path))
+    return loop.set_up(config, model.config, model.settings, objects, pixels)
 
 
 def train_all(seed: int) -> dict[tuple[tuple[int, ...], str], _Training]:

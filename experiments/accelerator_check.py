@@ -73,7 +73,8 @@ def main() -> None:
         print(line)
     print(f"{report.summary(results)}.")
     print(f"Report:   {out / 'report.md'}, {out / 'report.json'}")
-    print("Please attach both to an issue of the project if the device is an accelerator.")
+    if context.compares:
+        print("Please attach both to an issue of the project.")
     options = (f"--scene={_SCENE}", f"--preset={usual[-1]}", "--out=runs/ball")
     print(f"Next: {app.shell('train', *options)}")
 

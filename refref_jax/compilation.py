@@ -111,7 +111,7 @@ def chosen_by_platform(
 
     Like `jax.lax.platform_dependent`, it depends on what a program is lowered for, not on the
     devices of this process; but only the chosen function is traced, and only once, which matters
-    for large ones. It has no derivative; mapped over an axis, it is `cpu` on all platforms.
+    for large ones. It has no derivative.
 
     Args:
       name: name of the operation in printed programs.
@@ -123,8 +123,11 @@ def chosen_by_platform(
     primitive.multiple_results = True
 
     def flat(function: Callable[..., Any]) -> Callable[..., list[Array]]:
-        def of_leaves(*leaves: Array, tree: Any, options: tuple[tuple[str, Any], ...]) -> Any:
-            return jax.tree.leaves(function(*jax.tree.unflatten(tree, leaves), **dict(options)))
+        def of_leaves(*leaves: Array, tree: Any, options: Any, maps: tuple[Any, ...]) -> Any:
+            def one(*leaves: Array) -> list[Array]:
+                return jax.tree.leaves(function(*jax.tree.unflatten(tree, leaves), **dict(options)))
+
+            return functools.reduce(lambda f, axes: jax.vmap(f, in_axes=axes), maps, one)(*leaves)
 
         return of_leaves
 
@@ -132,11 +135,13 @@ def chosen_by_platform(
         found = jax.eval_shape(functools.partial(flat(like), **static), *leaves)
         return [jax.core.ShapedArray(x.shape, x.dtype) for x in found]
 
-    def mapped(leaves: Any, axes: Any, **static: Any) -> tuple[list[Array], list[int]]:
-        found = jax.vmap(functools.partial(flat(cpu), **static), in_axes=tuple(axes))(*leaves)
+    def mapped(
+        leaves: Any, axes: Any, *, maps: tuple[Any, ...], **static: Any
+    ) -> tuple[list[Array], list[int]]:
+        found = primitive.bind(*leaves, maps=(*maps, tuple(axes)), **static)
         return found, [0] * len(found)
 
-    bind = jax.jit(primitive.bind, static_argnames=("tree", "options"))
+    bind = jax.jit(primitive.bind, static_argnames=("tree", "options", "maps"))
     primitive.def_impl(bind)
     primitive.def_abstract_eval(shapes)
     batching.primitive_batchers[primitive] = mapped
@@ -146,7 +151,7 @@ def chosen_by_platform(
     def chosen(*arguments: Any, **options: Any) -> Any:
         leaves, tree = jax.tree.flatten(arguments)
         result = jax.tree.structure(jax.eval_shape(functools.partial(like, **options), *arguments))
-        static = {"tree": tree, "options": tuple(sorted(options.items()))}
+        static = {"tree": tree, "options": tuple(sorted(options.items())), "maps": ()}
         return jax.tree.unflatten(result, primitive.bind(*leaves, **static))
 
     return chosen

@@ -3,6 +3,7 @@
 Loops are tested where they are used.
 """
 
+import functools
 import importlib.metadata
 import os
 import subprocess
@@ -150,14 +151,21 @@ def test_the_function_for_cpus_is_used_on_a_cpu_eagerly_compiled_and_mapped():
         jax.tree.map(np.testing.assert_array_equal, function(pair, offset=2.0), expected)
     mapped = jax.vmap(lambda x: chosen((x, jnp.ones(())), offset=2.0))(pair[0])
     jax.tree.map(np.testing.assert_array_equal, mapped, expected)
+    over_both = jax.vmap(jax.vmap(lambda x, y: chosen((x, y), offset=2.0), (0, None)), (None, 0))
+    found = over_both(pair[0], jnp.arange(3.0))["sum"]
+    np.testing.assert_array_equal(found, 3.0 * np.arange(4.0) + np.arange(3.0)[:, None])
 
 
+@pytest.mark.parametrize("maps", [0, 1, 2])
 @pytest.mark.parametrize(
     ("platform", "name"), [("cpu", "cpu"), ("cuda", "other"), ("tpu", "other")]
 )
-def test_only_the_function_for_the_platform_is_traced_and_once(platform, name):
+def test_only_the_function_for_the_platform_is_traced_and_once(platform, name, maps):
     traced = []
-    chosen, pair = _by_platform(traced), (jnp.arange(4.0), jnp.ones(4))
-    program = jax.jit(lambda pair: chosen(pair, offset=1.0)).trace(pair)
+    chosen, pair = _by_platform(traced), (jnp.ones((4, 3, 2)), jnp.ones((4, 3, 2)))
+    function = functools.partial(chosen, offset=1.0)
+    for _ in range(maps):
+        function = jax.vmap(function)
+    program = jax.jit(function).trace(pair)
     text = program.lower(lowering_platforms=(platform,)).as_text()
     assert traced == [name] and ("sine" in text) == (name == "other")

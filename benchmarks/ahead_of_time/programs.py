@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks.training_setup import usual_samples
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics.light_paths import straight_ends
 from refref_jax.optics.path_settings import capacity_for
@@ -49,11 +50,15 @@ class Program(NamedTuple):
 def training(preset: str, multiple: int = loop.MULTIPLE) -> tuple[Program, Program]:
     """Returns the programs that trace light paths along the tree, and that take training steps.
 
+    Steps take the preset's usual samples, although fewer suffice on this scene.
+
     Args:
       preset: name of a preset.
       multiple: number that divides the capacity for paths; by default as on accelerators.
     """
-    asked = TrainConfig().override(scene=str(SCENE), preset=preset, paths="tree")
+    asked = TrainConfig().override(
+        scene=str(SCENE), preset=preset, paths="tree", samples_per_ray=usual_samples(preset)
+    )
     (config, model, *_), scene = prepare(asked, report=lambda line: None)
     scene = jax.tree.map(lambda x: jax.ShapeDtypeStruct(np.shape(x), x.dtype), scene)
     batch = require(config.schedule.batch)

@@ -14,13 +14,12 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from benchmarks.ahead_of_time.programs import SCENE
-from benchmarks.training_setup import sampler_of
 from refref_jax.geometry import bvh, bvh_nodes, traversal
 from refref_jax.optics import path_tracing, wavefront
 from refref_jax.optics.path_step import RayState
 from refref_jax.optics.scene import Scene
 from refref_jax.training.config import TrainConfig, require
-from refref_jax.training.fit import prepare
+from refref_jax.training.fit import prepare, read_pixels
 
 
 class Walks(NamedTuple):
@@ -40,7 +39,7 @@ def count(preset: str, *, block: int) -> Walks:
     asked = TrainConfig().override(scene=str(SCENE), preset=preset, paths="tree")
     (config, model, *_), scene = prepare(asked, report=lambda line: None)
     numbers = np.arange(require(config.schedule.pretraced_batches))
-    rays = jax.tree.map(jnp.asarray, sampler_of(config).draw(numbers).rays)
+    rays = jax.tree.map(jnp.asarray, read_pixels(config, SCENE).draw(numbers).rays)
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rays)
     slowest: list[int] = []
     cast = wavefront._cast

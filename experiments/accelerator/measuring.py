@@ -10,8 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from refref_jax.data import scene_folder
-from refref_jax.data.batches import PixelSampler
 from refref_jax.optics.scene import Scene
 from refref_jax.render.model import path_detail
 from refref_jax.training import fit, loop
@@ -188,11 +186,7 @@ def prepare_run(context: Context, preset: str) -> Run:
     )
     resolved, objects = fit.prepare(asked, report=lambda line: None)
     config, model = resolved.config, resolved.model
-    frames = scene_folder.read_frames(context.scene, "train")
-    batch = require(config.schedule.batch)
-    sampler = PixelSampler(
-        scene_folder.read_images(frames), frames.cameras, seed=config.seed, batch=batch
-    )
+    sampler = fit.read_pixels(config, context.scene)
     setup = loop.set_up(config, model.config, model.settings, objects, sampler)
     batches = require(config.schedule.pretraced_batches)
     drawn = sampler.draw(sampler.numbers(0, batches))

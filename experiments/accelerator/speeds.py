@@ -40,7 +40,10 @@ from refref_jax.render.model import Model
 from refref_jax.training import backdrop_equations, backdrop_solver, fit
 from refref_jax.training.config import TrainConfig
 
-_PACKAGES = ("jax", "jaxlib", "jax-cuda12-plugin", "jax-cuda13-plugin", "flax", "optax", "numpy")
+_PACKAGES = (
+    *("jax", "jaxlib", "jax-cuda12-plugin", "jax-cuda13-plugin", "warp-lang"),
+    *("flax", "optax", "numpy"),
+)
 
 # Environment variables of JAX that change programs or memory; others may name files.
 _VARIABLES = (
@@ -202,7 +205,7 @@ def steps(context: Context, preset: str) -> Iterator[Row]:
 
 
 def rendering(context: Context, preset: str) -> Iterator[Row]:
-    """Times the rendering of one tile: an image of the scene, untrained."""
+    """Times the rendering of an image of the scene by an untrained model."""
     run = prepare_run(context, preset)
     setup = run.setup
     params = jax.device_put(run.state.params, context.device)
@@ -211,7 +214,7 @@ def rendering(context: Context, preset: str) -> Iterator[Row]:
     rays = image_rays(cameras, 0)
     first, _ = seconds_of(lambda: images.render_image(model, rays))
     seconds = best_of(lambda: images.render_image(model, rays))
-    yield Row(f"a tile of {cameras.width} x {cameras.height} rays", 1e3 * seconds, "ms")
+    yield Row(f"an image of {cameras.width} x {cameras.height} rays", 1e3 * seconds, "ms")
     yield Row("rays per second", rays.radii.size / seconds / 1e3, "thousand")
     yield Row("compiling", max(0.0, first - seconds), "s")
     yield from _peak(context)

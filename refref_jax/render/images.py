@@ -402,10 +402,12 @@ def render_camera(
     return join(bands)
 
 
-def warm_up(model: Model, cameras: Cameras, *, chunk: int | None) -> None:
-    """Compiles all programs of rendering, so that later timings are of rendering alone."""
-    zero = np.zeros(1, np.int64)
-    render_image(model, pixel_rays(cameras, zero, zero, zero), chunk=chunk)
+def warm_up(model: Model, cameras: Cameras, *, rays_per_pixel: int, chunk: int | None) -> None:
+    """Compiles all programs of `render_camera`, so that later timings are of rendering alone."""
+    if runs_on_cpu():  # where one tile size serves all images
+        render_image(model, pixel_rays(cameras, *np.zeros((3, 1), np.int64)), chunk=chunk)
+    else:
+        render_camera(model, cameras, 0, rays_per_pixel=rays_per_pixel, chunk=chunk)
 
 
 def average(fine: Rendering, side: int) -> Rendering:

@@ -50,7 +50,10 @@ _FAR_FIELD = (
 _BOUNDS = ("scene", "properties", "background", "radius", "contraction")
 
 # Options that determine the number of samples.
-_SAMPLES = ("preset", "field", "background", "paths", "interior", "contraction", "far_field")
+_SAMPLES = (
+    *(*_OBJECTS, "preset", "field", "background", "radius", "centre", "paths", "max_bends"),
+    *("interior", "contraction", "far_field"),
+)
 
 # Maximum number of steps, rays and batches, which are 32-bit integers.
 _MOST = 2**31 - 1

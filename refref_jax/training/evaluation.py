@@ -137,7 +137,7 @@ def evaluate(
     truth = read_truth(Path(scene), split)
     chosen = spread(len(truth.images), limit)
     views = truth.frames.cameras
-    images.warm_up(model, views, chunk=chunk)
+    images.warm_up(model, views, rays_per_pixel=rays_per_pixel, chunk=chunk)
     if progress is not None:
         progress(0, len(chosen), "")
     per_image: list[dict[str, Any]] = []

@@ -278,7 +278,7 @@ def train(
             if step < total:
                 report(f"Stopped at iteration {step}.")
             return step == total
-        sampler = _sampler(config, folder, objects if surface else None)
+        sampler = read_pixels(config, folder, objects=objects if surface else None)
         setup = loop.set_up(config, model.config, model.settings, objects, sampler, mesh=mesh)
         _report_misses(setup, report)
         begun = time.monotonic()
@@ -309,8 +309,14 @@ def _report_misses(setup: loop.Setup, report: Callable[[str], None]) -> None:
         )
 
 
-def _sampler(config: TrainConfig, scene: Path, objects: Scene | None) -> PixelSampler:
-    """Reads the training pixels of a run, or only those whose rays meet given objects."""
+def read_pixels(config: TrainConfig, scene: Path, *, objects: Scene | None = None) -> PixelSampler:
+    """Reads the training pixels of a resolved configuration.
+
+    Args:
+      config: configuration of the run.
+      scene: folder of the scene.
+      objects: objects that the rays of the pixels have to meet; all pixels by default.
+    """
     frames = scene_folder.read_frames(scene, "train")
     kept = None
     if config.scene.pixels == "background":

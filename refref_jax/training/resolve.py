@@ -317,9 +317,11 @@ def _resolve_model(
     fields = () if model.interior == "field" else facts.analysis.field_parts
     model = dataclasses.replace(model, learned_tints=learned, field_parts=fields)
     config = _resolve_far_field(config, facts, reasons)
-    if config.model.far_field == "field" and _is_surface_alone(config, facts)[0]:
+    fewer = preset.background_samples(model) if config.model.far_field == "field" else None
+    # Images are only compared with the background if it matters.
+    if fewer and not config.model.samples_per_ray and _is_surface_alone(config, facts)[0]:
         why = f"preset={config.model.preset}, and only the background is behind the objects"
-        config = _decide(config, reasons, why, samples_per_ray=preset.background_samples(model))
+        config = _decide(config, reasons, why, samples_per_ray=fewer)
     in_front: choices.InFront = "field" if _in_front(config, facts) else "nothing"
     model = presets.override_model(model, config.model, in_front=in_front)
     why = f"preset={config.model.preset}"
@@ -396,7 +398,7 @@ def _choose_far_field(
 
 
 def _is_surface_alone(config: TrainConfig, facts: SceneFacts) -> tuple[bool, str]:
-    """Returns whether behind the objects is but the background's surface, and the reason."""
+    """Returns whether only the background's surface is behind the objects, and the reason."""
     if facts.misfits is None or not facts.stated:
         return False, "the scene does not state what is behind the objects"
     surface = f"{choices.SURFACES[require(config.scene.space)]} that {facts.stated} states"

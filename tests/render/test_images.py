@@ -87,6 +87,18 @@ def test_nothing_is_compiled_twice(model):
     assert (images._trace_tile._cache_size(), images._render_chunk._cache_size()) == before
 
 
+@pytest.mark.parametrize("rays_per_pixel", [1, 4])
+def test_no_image_compiles_after_the_warm_up_off_cpus(model, monkeypatch, rays_per_pixel):
+    monkeypatch.setattr(images, "runs_on_cpu", lambda: False)
+    monkeypatch.setattr(images, "TILE", 16)
+    monkeypatch.setattr(images, "_SMALLEST_TILE", 16)
+    straight = model._replace(settings=STRAIGHT)
+    images.warm_up(straight, CAMERAS, rays_per_pixel=rays_per_pixel, chunk=64)
+    before = images._trace_tile._cache_size(), images._render_chunk._cache_size()
+    images.render_camera(straight, CAMERAS, 0, rays_per_pixel=rays_per_pixel, chunk=64)
+    assert (images._trace_tile._cache_size(), images._render_chunk._cache_size()) == before
+
+
 def _first(images, count):
     """Returns the first pixels of each image."""
     return jax.tree.map(lambda x: x.reshape(256, *x.shape[2:])[:count], images)

@@ -177,9 +177,32 @@ def test_a_field_that_only_shows_walls_needs_few_samples(found, share, given, ex
     assert unstated.config.model.samples_per_ray != (16, 8)
 
 
-@pytest.mark.parametrize("given", [{"paths": "straight"}, {"background": "unbounded"}])
+@pytest.mark.parametrize(
+    "given", [{"preset": "small"}, {"paths": "straight"}, {"samples_per_ray": (9, 7)}]
+)
+def test_images_are_not_compared_with_walls_if_no_fewer_samples_depend_on_it(given):
+    def misfits(**bounds):
+        raise AssertionError("The images were read.")
+
+    stated = {"stated": "scene.json", "misfits": misfits}
+    facts = SceneFacts(_CLEAR, CAMERAS, (), None, None, (), **stated)
+    resolve(TrainConfig().override(batch=64, far_field="field", **given), facts)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"paths": "straight"},
+        {"max_bends": 0},
+        {"background": "unbounded"},
+        {"radius": 3.0},
+        {"centre": (0.0, 0.0, 1.0)},
+        {"scene": "b"},
+    ],
+)
 def test_the_number_of_samples_is_decided_again_with_what_it_follows_from(given):
-    config = TrainConfig().decided(samples_per_ray=(16, 8), far_field="field", paths="tree")
+    config = TrainConfig().override(far_field="field", interior="clear")
+    config = config.decided(samples_per_ray=(16, 8), paths="tree")
     assert config.override(**given).model.samples_per_ray is None
     assert config.override(samples_per_ray=(5, 4), **given).model.samples_per_ray == (5, 4)
 
