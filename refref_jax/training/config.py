@@ -22,8 +22,8 @@ from refref_jax.optics.path_settings import Reentry, check_max_bends, check_min_
 
 _Value = TypeVar("_Value")
 
-# Options that determine the objects.
-_OBJECTS = ("scene", "properties", "reconstruction")
+# Options that determine the objects, and the shape of the fields.
+_OBJECTS, _KIND = ("scene", "properties", "reconstruction"), ("preset", "field")
 
 FIELD_ONLY = (
     *("preset", "field", "footprint", "samples_per_ray", "multisamples", "dilation"),
@@ -50,10 +50,7 @@ _FAR_FIELD = (
 _BOUNDS = ("scene", "properties", "background", "radius", "contraction")
 
 # Options that determine the number of samples.
-_SAMPLES = (
-    *(*_OBJECTS, "preset", "field", "background", "radius", "centre", "paths", "max_bends"),
-    *("interior", "contraction", "far_field"),
-)
+_SAMPLES = (*_BOUNDS, *_OBJECTS, "centre", "paths", "max_bends", "interior", "far_field", *_KIND)
 
 # Maximum number of steps, rays and batches, which are 32-bit integers.
 _MOST = 2**31 - 1
@@ -201,18 +198,18 @@ class FieldConfig:
 
     preset: choices.PresetName = option("tiny")
     field: choices.FieldName = option("zipnerf")
-    sub_spaces: int | None = option(None, after=("preset", "field"))
+    sub_spaces: int | None = option(None, after=_KIND)
     interior: choices.Interior | None = option(
         None, after=(*_OBJECTS, "paths", "max_bends", "tints")
     )
     tints: choices.Tints | None = option(None, after=(*_OBJECTS, "paths", "max_bends", "interior"))
-    footprint: choices.Footprint | None = option(None, after=("preset", "field"))
+    footprint: choices.Footprint | None = option(None, after=_KIND)
     samples_per_ray: tuple[int, ...] | None = option(None, formerly="samples", after=_SAMPLES)
-    multisamples: int | None = option(None, after=("preset", "field"))
-    log2_hashmap_size: int | None = option(None, formerly="entries", after=("preset", "field"))
-    max_res: int | None = option(None, formerly="finest", after=("preset", "field"))
-    precision: choices.Precision | None = option(None, after=("preset", "field"))
-    dilation: float | None = option(None, after=("preset", "field"))
+    multisamples: int | None = option(None, after=_KIND)
+    log2_hashmap_size: int | None = option(None, formerly="entries", after=_KIND)
+    max_res: int | None = option(None, formerly="finest", after=_KIND)
+    precision: choices.Precision | None = option(None, after=_KIND)
+    dilation: float | None = option(None, after=_KIND)
     colour_network: choices.ColourNetwork = option("plain")
     contraction: choices.Contraction = option("unbounded")
     near: float | None = option(None, after=_BOUNDS, comparison="none")
