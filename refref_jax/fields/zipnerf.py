@@ -30,7 +30,7 @@ from refref_jax.fields.hash_grid import HashGridConfig
 from refref_jax.fields.mlps import (
     GridDensityConfig,
     GridRadianceConfig,
-    colour,
+    density_and_colour,
     grid_network,
     nowhere,
 )
@@ -118,16 +118,9 @@ class _RadianceField(nn.Module):
     @nn.compact
     def __call__(self, gaussians: Gaussians, direction: Float[Array, "3"]) -> Radiance:
         config = self.config
-        raw = grid_network(
-            gaussians,
-            config.grid,
-            width=config.density_width,
-            outputs=1 + config.bottleneck,
-            precision=config.precision,
-        )
-        rgb = colour(raw[1:], direction, config)
+        density, rgb = density_and_colour(gaussians, direction, config)
         padded = rgb * (1.0 + 2.0 * _COLOUR_PADDING) - _COLOUR_PADDING
-        return Radiance(activate_density(raw[0]), padded)
+        return Radiance(activate_density(density), padded)
 
 
 def _proposal(
