@@ -64,6 +64,7 @@ def _iterations(scene: Scene, state: RayState, alive: Bool[Array, ""]) -> Array:
     """Returns the number of iterations in which a ray walks through the tree."""
     tree = scene.surfaces.bvh
     nodes = tree.nodes.reshape(-1, bvh_nodes.WORDS)
+    boxes = bvh_nodes.boxes(nodes)
     limit = jnp.where(alive, jnp.inf, -1.0).astype(jnp.float32)
     ray, end, start = traversal.begin_ray(
         nodes, state.origin, state.direction, limit, state.exclude_primitive
@@ -71,7 +72,7 @@ def _iterations(scene: Scene, state: RayState, alive: Bool[Array, ""]) -> Array:
 
     def advance(carry: tuple[traversal.RayWalk, Array]) -> tuple[traversal.RayWalk, Array]:
         walk, taken = carry
-        return traversal.advance_ray(nodes, tree.facets, ray, end, walk), taken + 1
+        return traversal.advance_ray(boxes, tree.facets, ray, end, walk), taken + 1
 
     start = (start, jnp.zeros((), jnp.int32))
     return jax.lax.while_loop(lambda carry: carry[0].node < end, advance, start)[1]

@@ -44,7 +44,12 @@ def check_precision(precision: str) -> None:
 
 def dense(precision: Precision) -> Callable[..., nn.Dense]:
     """Returns flax's dense layer, `x @ kernel + bias`, with factors in a given precision."""
-    return nn.Dense if precision == "float32" else functools.partial(nn.Dense, dot_general=_product)
+    return functools.partial(nn.Dense, dot_general=dot_general(precision))
+
+
+def dot_general(precision: Precision) -> Callable[..., Array]:
+    """Returns `jax.lax.dot_general`, or one that rounds its factors to bfloat16."""
+    return jax.lax.dot_general if precision == "float32" else _product
 
 
 def _product(left: Array, right: Array, axes: Any, precision: None = None) -> Array:

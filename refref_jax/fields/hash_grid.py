@@ -10,7 +10,9 @@ for the down-weighting.
 """
 
 import dataclasses
+import functools
 import math
+from collections.abc import Callable
 from typing import Any
 
 import flax.linen as nn
@@ -21,7 +23,7 @@ from jaxtyping import Array, Float
 from refref_jax import numerics
 from refref_jax.choices import ColourNetwork, Precision
 from refref_jax.configuration import FORMERLY
-from refref_jax.fields.base import DensityConfig, RadianceConfig, dense
+from refref_jax.fields.base import DensityConfig, RadianceConfig, dense, dot_general
 from refref_jax.fields.hash_grid_kernels import interpolate
 from refref_jax.sampling.polylines import Gaussians
 
@@ -237,6 +239,113 @@ def grid_network(
     # Flax numbers layers in order of creation, and checkpoints contain these names.
     hidden = nn.relu(layer(width)(features))
     return layer(outputs)(hidden)
+
+
+def density_and_colour(
+    gaussians: Gaussians, direction: Float[Array, "3"], config: GridRadianceConfig
+) -> tuple[Float[Array, ""], Float[Array, "3"]]:
+    """Returns a density without activation, and a colour in `[0, 1]`, on the grid's mean features.
+
+    A hidden layer gives density and bottleneck; the colour network takes the latter and the
+    encoded direction. Off CPUs, the bottleneck is not formed: between it and the first layer of
+    colour there is no non-linearity, so that both are one layer, whose weights are a product. What
+    a step writes and reads for networks is then halved, and only rounding differs.
+
+    Args:
+      gaussians: multisamples in the unit cube.
+      direction: unit direction of travel.
+      config: shape of the field.
+    """
+    layer = dense(config.precision)
+    features = MultisampledGrid(config.grid, config.precision)(gaussians)
+    hidden = nn.relu(layer(config.density_width)(features))
+    if config.colour_network == "skip" or not config.colour_depth:
+        raw = layer(1 + config.bottleneck)(hidden)
+        return raw[0], colour(raw[1:], direction, config)
+    encoded = spherical_harmonics(direction)
+    # Names are those that flax would give to layers, as checkpoints contain them.
+    widths = config.bottleneck + encoded.size, config.colour_width
+    multiply = multiplied_by(config.precision)
+    density, hidden = jax.lax.platform_dependent(
+        hidden,
+        encoded,
+        _Weights(config.density_width, 1 + config.bottleneck, name="Dense_1")(),
+        _Weights(*widths, name="Dense_2")(),
+        cpu=functools.partial(in_turn, multiply),
+        default=functools.partial(joined, multiply),
+    )
+    hidden = nn.relu(hidden)
+    for i in range(1, config.colour_depth):
+        hidden = nn.relu(layer(config.colour_width, name=f"Dense_{2 + i}")(hidden))
+    return density, jax.nn.sigmoid(layer(3, name=f"Dense_{2 + config.colour_depth}")(hidden))
+
+
+class _Weights(nn.Module):
+    """Kernel and bias of a dense layer of flax."""
+
+    inputs: int
+    outputs: int
+
+    @nn.compact
+    def __call__(self) -> tuple[Float[Array, "inputs outputs"], Float[Array, " outputs"]]:
+        kernel = self.param("kernel", nn.initializers.lecun_normal(), (self.inputs, self.outputs))
+        return kernel, self.param("bias", nn.initializers.zeros_init(), (self.outputs,))
+
+
+_Layer = tuple[Float[Array, "_ _"], Float[Array, " _"]]
+"""Kernel and bias."""
+
+_Multiply = Callable[[Array, Array], Array]
+
+
+def multiplied_by(precision: Precision) -> _Multiply:
+    """Returns the product of a vector and a kernel, as in flax's dense layer."""
+    dot = dot_general(precision)
+    return lambda values, kernel: dot(values, kernel, (((0,), (0,)), ((), ())), precision=None)
+
+
+def in_turn(
+    multiply: _Multiply,
+    hidden: Float[Array, " width"],
+    encoded: Float[Array, "16"],
+    head: _Layer,
+    first: _Layer,
+) -> tuple[Float[Array, ""], Float[Array, " colour_width"]]:
+    """Returns density, and outputs of the first layer of colour, both without activation.
+
+    Args:
+      multiply: product of a vector and a kernel.
+      hidden: outputs of the hidden layer of density.
+      encoded: encoded direction.
+      head: layer with the outputs density and bottleneck.
+      first: layer of bottleneck and encoded direction.
+    """
+    with jax.named_scope("Dense_1"):
+        raw = multiply(hidden, head[0]) + head[1]
+    with jax.named_scope("Dense_2"):
+        inputs = jnp.concatenate([raw[1:], encoded])
+        return raw[0], multiply(inputs, first[0]) + first[1]
+
+
+def joined(
+    multiply: _Multiply,
+    hidden: Float[Array, " width"],
+    encoded: Float[Array, "16"],
+    head: _Layer,
+    first: _Layer,
+) -> tuple[Float[Array, ""], Float[Array, " colour_width"]]:
+    """Returns the same as `in_turn`, as one layer whose weights are the product of both."""
+    kernel, bias = head
+    bottleneck = kernel.shape[1] - 1
+    with jax.named_scope("Dense_1"):
+        density = multiply(hidden, kernel[:, :1])[0] + bias[0]
+    with jax.named_scope("Dense_2"):
+        of_bottleneck, of_direction = first[0][:bottleneck], first[0][bottleneck:]
+        both = numerics.product(kernel[:, 1:], of_bottleneck)
+        shift = numerics.product(bias[1:], of_bottleneck) + first[1]
+        inputs = jnp.concatenate([hidden, encoded])
+        outputs = multiply(inputs, jnp.concatenate([both, of_direction])) + shift
+    return density, outputs
 
 
 def colour(

@@ -35,7 +35,7 @@ from refref_jax.fields.hash_grid import (
     GridDensityConfig,
     GridRadianceConfig,
     HashGridConfig,
-    colour,
+    density_and_colour,
     grid_network,
     nowhere,
 )
@@ -120,15 +120,8 @@ class _RadianceField(nn.Module):
     @nn.compact
     def __call__(self, gaussians: Gaussians, direction: Float[Array, "3"]) -> Radiance:
         config = self.config
-        raw = grid_network(
-            _points(gaussians),
-            config.grid,
-            width=config.density_width,
-            outputs=1 + config.bottleneck,
-            precision=config.precision,
-        )
-        rgb = colour(raw[1:], direction, config)
-        return Radiance(numerics.truncated_exponential(raw[0]), rgb)
+        density, rgb = density_and_colour(_points(gaussians), direction, config)
+        return Radiance(numerics.truncated_exponential(density), rgb)
 
 
 def _proposal(*, levels: int, max_res: int, hashmap_size: int) -> NerfactoProposalConfig:

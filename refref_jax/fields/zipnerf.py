@@ -30,7 +30,7 @@ from refref_jax.fields.hash_grid import (
     GridDensityConfig,
     GridRadianceConfig,
     HashGridConfig,
-    colour,
+    density_and_colour,
     grid_network,
     nowhere,
 )
@@ -123,16 +123,8 @@ class _RadianceField(nn.Module):
     @nn.compact
     def __call__(self, gaussians: Gaussians, direction: Float[Array, "3"]) -> Radiance:
         config = self.config
-        raw = grid_network(
-            gaussians,
-            config.grid,
-            width=config.density_width,
-            outputs=1 + config.bottleneck,
-            precision=config.precision,
-        )
-        rgb = colour(raw[1:], direction, config)
-        padded = pad_colour(rgb)
-        return Radiance(activate_density(raw[0]), padded)
+        density, rgb = density_and_colour(gaussians, direction, config)
+        return Radiance(activate_density(density), pad_colour(rgb))
 
 
 def _proposal(

@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Complex, Float, Int
 
 from refref_jax import numerics
 
@@ -39,6 +39,9 @@ WORDS = 8
 
 LEAF_SIZE = 4
 """Maximum number of triangles in a leaf, and the number tested at each leaf visit."""
+
+BOXES = 3
+"""Number of rows that a read of `boxes` returns."""
 
 NONE = 2**31 - 1
 """Slot for "no triangle", above all others."""
@@ -127,6 +130,36 @@ def read_node(nodes: Int[Array, "rows 8"], index: Int[Array, ""]) -> Node:
     words = read_row(nodes, index)
     corners = jax.lax.bitcast_convert_type(words[:6], jnp.float32)
     return Node(corners[:3], corners[3:], words[6], words[7])
+
+
+def boxes(nodes: Int[Array, "rows 8"]) -> Complex[Array, "padded 4"]:
+    """Returns the nodes for lock-step traversal: pairs of words are real and imaginary parts.
+
+    The first three pairs are entry and exit corner. The last real part is the *link*, bit-cast:
+    minus the leaf, or the skip pointer of a node that is none; a leaf that is missed continues at
+    the following row in any case. XLA repeats the computation of a row's index for every column
+    that is read, and these are half as many. The last row is repeated for `read_boxes`.
+    """
+    nodes = jnp.concatenate([nodes, jnp.repeat(nodes[-1:], BOXES - 1, axis=0)])
+    corners = jax.lax.bitcast_convert_type(nodes[:, :6], jnp.float32)
+    link = jnp.where(nodes[:, 7:] > 0, -nodes[:, 7:], nodes[:, 6:7])
+    words = jax.lax.bitcast_convert_type(link, jnp.float32)
+    parts = [jnp.concatenate([corners[:, at : at + 3], words], axis=1) for at in (0, 3)]
+    return jax.lax.complex(*parts)
+
+
+def read_boxes(boxes: Complex[Array, "padded 4"], index: Int[Array, ""]) -> Complex[Array, "3 4"]:
+    """Returns `BOXES` rows of `boxes` from an index."""
+    index = index.astype(jnp.uint32)
+    start = (index, jnp.zeros_like(index))
+    return jax.lax.dynamic_slice(boxes, start, (BOXES, 4), allow_negative_indices=False)
+
+
+def corners_and_link(
+    box: Complex[Array, "4"],
+) -> tuple[Float[Array, "3"], Float[Array, "3"], Int[Array, ""]]:
+    """Returns entry corner, exit corner and link of a row of `boxes`."""
+    return box[:3].real, box[:3].imag, jax.lax.bitcast_convert_type(box[3].real, jnp.int32)
 
 
 def read_row(table: Array, index: Int[Array, ""]) -> Array:

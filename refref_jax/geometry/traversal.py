@@ -12,7 +12,9 @@ the tree once for each, with the other rays masked.
 
 On an accelerator, the state of a ray's loop is a row of the node table and the closest hit so far.
 Under `vmap`, `trace_ray` becomes one loop over all rays, which ends with the slowest ray. Between
-two iterations the host waits for the accelerator, so each iteration visits several nodes.
+two iterations the host waits for the accelerator, so each iteration visits many nodes, and tests
+the few leaves that it met at its end. A read from a computed row costs most of a kernel, so each
+one reads the following rows, too, which are the likely next nodes.
 
 The kernel (`trace_in_warp`) is `trace_ray` again, over the same tables and with the same rules of
 edges, ties and of the triangle that a ray leaves: a change of one is a change of both. It is
@@ -28,7 +30,7 @@ from typing import Any, NamedTuple, no_type_check
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Complex, Float, Int
 
 from refref_jax.compilation import native_loop
 from refref_jax.geometry import bvh_nodes, triangles
@@ -39,8 +41,8 @@ PACKET = 16
 _VISITS = 2
 """Number of nodes that a packet visits in one iteration of the loop."""
 
-_VISITS_OF_RAY = 8
-"""Number of nodes that a single ray visits in one iteration of the loop."""
+# Reads of nodes by a single ray in one iteration of the loop, and leaves that it can meet in it.
+_READS_OF_RAY, _LEAVES_OF_RAY = 16, 4
 
 # Options with which Warp compiles operations as they are written.
 _WARP_OPTIONS = {"enable_backward": False, "fuse_fp": False, "fast_math": False}
@@ -262,10 +264,9 @@ def trace_ray(
       The distance and index of the closest hit; the limit and `NONE` for a miss.
     """
     ray, end, start = begin_ray(nodes, origin, direction, limit, exclude_primitive)
+    boxes = bvh_nodes.boxes(nodes)
     walk = jax.lax.while_loop(
-        lambda walk: walk.node < end,
-        lambda walk: advance_ray(nodes, packed, ray, end, walk),
-        start,
+        lambda walk: walk.node < end, lambda walk: advance_ray(boxes, packed, ray, end, walk), start
     )
     return walk.distance, walk.primitive_id
 
@@ -287,63 +288,71 @@ def begin_ray(
 
 
 def advance_ray(
-    nodes: Int[Array, "rows 8"],
+    boxes: Complex[Array, "padded 4"],
     packed: Float[Array, "primitives 12"],
     ray: Ray,
     end: Int[Array, ""],
     walk: RayWalk,
 ) -> RayWalk:
-    """Visits `_VISITS_OF_RAY` nodes in sequence; beyond the end of the table nothing happens."""
-    return jax.lax.fori_loop(
-        0,
-        _VISITS_OF_RAY,
-        lambda _, walk: _visit_by_ray(nodes, packed, ray, end, walk),
-        walk,
-        unroll=True,
-    )
+    """Reads nodes `_READS_OF_RAY` times, then tests the leaves that the ray met.
+
+    The ray waits at a leaf if it has met `_LEAVES_OF_RAY` before. At the end of the table it stays.
+    """
+    seen = _Seen(walk.node, (jnp.zeros_like(walk.node),) * _LEAVES_OF_RAY)
+
+    def read(_: int | Array, seen: _Seen) -> _Seen:
+        first, rows = seen.node, bvh_nodes.read_boxes(boxes, seen.node)
+        for offset in range(bvh_nodes.BOXES):
+            visited = _visit_by_ray(rows[offset], ray, walk.distance, seen)
+            is_next = (seen.node == first + offset) & (first + offset < end)
+            seen = jax.tree.map(functools.partial(jnp.where, is_next), visited, seen)
+        return seen
+
+    # XLA:CPU, for tests alone, would repeat the computation of all reads in each later one.
+    loop = functools.partial(jax.lax.fori_loop, 0, _READS_OF_RAY, read)
+    seen = jax.lax.platform_dependent(seen, cpu=loop, default=functools.partial(loop, unroll=True))
+    walk = walk._replace(node=seen.node)
+    for leaf in seen.leaves:
+        walk = _test_leaf_of_ray(packed, ray, leaf, walk)
+    return walk
+
+
+class _Seen(NamedTuple):
+    """The next node, and the leaves met so far (first triangle + 1, 0 for none)."""
+
+    node: Int[Array, ""]
+    leaves: tuple[Int[Array, ""], ...]
 
 
 def _visit_by_ray(
-    nodes: Int[Array, "rows 8"],
-    packed: Float[Array, "primitives 12"],
-    ray: Ray,
-    end: Int[Array, ""],
-    walk: RayWalk,
-) -> RayWalk:
-    """Visits the next node, and tests its triangles if it is a leaf."""
-    node = bvh_nodes.read_node(nodes, walk.node)
-    more = walk.node < end
-    hit = bvh_nodes.overlaps(ray.slabs, node.entry, node.exit, walk.distance) & more
-    distance, primitive_id = jax.lax.cond(
-        hit & (node.leaf > 0),
-        lambda: _test_leaf_of_ray(
-            packed, ray.origin, ray.direction, ray.exclude_primitive, node.leaf - 1, walk
-        ),
-        lambda: (walk.distance, walk.primitive_id),
-    )
-    after = jnp.where(hit, walk.node + 1, node.skip)
-    return RayWalk(jnp.where(more, after, walk.node), distance, primitive_id)
+    box: Complex[Array, "4"], ray: Ray, reach: Float[Array, ""], seen: _Seen
+) -> _Seen:
+    """Visits the next node, whose box is given."""
+    entry, exit, link = bvh_nodes.corners_and_link(box)
+    hit, is_leaf = bvh_nodes.overlaps(ray.slabs, entry, exit, reach), link < 0
+    waiting = hit & is_leaf
+    leaves = []
+    for leaf in seen.leaves:
+        leaves.append(jnp.where(waiting & (leaf == 0), -link, leaf))
+        waiting &= leaf > 0
+    after = jnp.where(hit | is_leaf, seen.node + 1, link)
+    return _Seen(jnp.where(waiting, seen.node, after), tuple(leaves))
 
 
 def _test_leaf_of_ray(
-    packed: Float[Array, "primitives 12"],
-    origin: Float[Array, "3"],
-    direction: Float[Array, "3"],
-    exclude_primitive: Int[Array, ""],
-    first: Int[Array, ""],
-    walk: RayWalk,
-) -> tuple[Float[Array, ""], Int[Array, ""]]:
+    packed: Float[Array, "primitives 12"], ray: Ray, leaf: Int[Array, ""], walk: RayWalk
+) -> RayWalk:
     """Returns the closest of the hit so far and the hits in one leaf; the lower index wins ties."""
-    distance, primitive_id = walk.distance, walk.primitive_id
+    node, distance, primitive_id = walk
     for offset in range(bvh_nodes.LEAF_SIZE):
-        candidate = first + offset
+        candidate = jnp.maximum(leaf - 1, 0) + offset
         facet = bvh_nodes.read_row(packed, candidate)
-        found = triangles.distance(origin, direction, facet)
+        found = triangles.distance(ray.origin, ray.direction, facet)
         closer = (found < distance) | ((found == distance) & (candidate < primitive_id))
-        closer = closer & (candidate != exclude_primitive)
+        closer = closer & (candidate != ray.exclude_primitive) & (leaf > 0)
         distance = jnp.where(closer, found, distance)
         primitive_id = jnp.where(closer, candidate, primitive_id)
-    return distance, primitive_id
+    return RayWalk(node, distance, primitive_id)
 
 
 def trace_in_warp(

@@ -48,3 +48,28 @@ def test_spherical_harmonics_check_grads():
 def test_transformations_change_nothing(transformation):
     directions = jnp.asarray(_directions()[:8], jnp.float32)
     transformation(hash_grid.spherical_harmonics, (directions,))
+
+
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_two_linear_layers_in_a_row_are_one(precision):
+    # Off CPUs, the bottleneck is not formed: values and slopes are those of both layers in turn.
+    numbers = np.random.default_rng(1)
+    shapes = (8,), (16,), ((8, 6), (6,)), ((5 + 16, 7), (7,))
+    arguments = jax.tree.map(
+        lambda shape: jnp.asarray(numbers.normal(size=shape), jnp.float32),
+        shapes,
+        is_leaf=lambda x: isinstance(x[0], int),
+    )
+    multiply = hash_grid.multiplied_by(precision)
+
+    def value_and_slopes(layers):
+        def squares(*arguments):
+            density, outputs = layers(multiply, *arguments)
+            return density**2 + jnp.sum(outputs**2)
+
+        return jax.jit(jax.value_and_grad(squares, argnums=(0, 1, 2, 3)))(*arguments)
+
+    both = value_and_slopes(hash_grid.in_turn), value_and_slopes(hash_grid.joined)
+    tolerance = 1e-5 if precision == "float32" else 0.05
+    for one, other in zip(*map(jax.tree.leaves, both), strict=True):
+        np.testing.assert_allclose(one, other, atol=tolerance * np.abs(one).max())
