@@ -57,9 +57,9 @@ _TRUTH = flags.DEFINE_integer("truth", 4096, "Samples of the truth.")
 _ROUNDS = flags.DEFINE_integer("rounds", 2, "Timed renderings of every image.")
 
 _SAMPLES = (16, 64, 256, 1024)
-_UNIFORM = (1, 4, 9, 16, 36)
+_UNIFORM = (1, 4, 9, 16)
 # First rays, refined rays, and tolerance.
-_ADAPTIVE = ((4, 16, 0.1), (4, 16, 0.02), (9, 36, 0.05), (9, 36, 0.01), (9, 64, 0.005))
+_ADAPTIVE = ((1, 4, 0.2), (1, 16, 0.2), (4, 16, 0.1), (4, 36, 0.1), (9, 64, 0.1))
 _FINE_TREE = dataclasses.replace(TREE, min_throughput=0.005, max_bends=32)
 _HERE = Path(__file__).parent
 _DATASET = _HERE.parent / "experiments" / "dataset"
