@@ -310,7 +310,7 @@ def _rays_of_pixels(
     pixel = np.broadcast_to((row * cameras.width + column)[..., None], fine_row.shape)
     subpixel = np.broadcast_to(np.arange(side**2), fine_row.shape)
     strata = np.stack([pixel, subpixel, np.full(fine_row.shape, side**2)], axis=-1)
-    return rays._replace(strata=strata.astype(np.int32))
+    return rays._replace(strata=numerics.host_array(strata.astype(np.int32)))
 
 
 def _contrast(rgb: Float[np.ndarray, "h w rays 3"]) -> Float[np.ndarray, "h w"]:
