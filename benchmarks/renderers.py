@@ -42,7 +42,8 @@ from absl import app, flags
 
 from benchmarks.oracles import colours
 from refref_jax.data import mesh_queries, meshes, scene_assembly
-from refref_jax.geometry import cameras
+from refref_jax.data.meshes import MeshPart
+from refref_jax.geometry import cameras, triangle_meshes
 from refref_jax.optics.path_settings import TREE
 from refref_jax.render import images, radiance_of, render_known_camera
 
@@ -59,8 +60,11 @@ _ROUNDS = flags.DEFINE_integer("rounds", 2, "Timed renderings of every image.")
 _SAMPLES = (16, 64, 256, 1024)
 _UNIFORM = (1, 4, 9, 16)
 # First rays, refined rays, and tolerance.
-_ADAPTIVE = ((1, 4, 0.2), (1, 16, 0.2), (4, 16, 0.1), (4, 36, 0.1), (9, 64, 0.1))
-_FINE_TREE = dataclasses.replace(TREE, min_throughput=0.005, max_bends=32)
+_ADAPTIVE = ((1, 4, 0.1), (1, 16, 0.1), (4, 16, 0.1), (4, 36, 0.1), (9, 64, 0.1))
+_FINE = dataclasses.replace(TREE, min_throughput=0.005, max_bends=32)
+_NOISE = "noise of the truth"
+_REFINED = "tree, refined"
+_LEAST_RAYS = 4.0
 _HERE = Path(__file__).parent
 _DATASET = _HERE.parent / "experiments" / "dataset"
 
@@ -86,6 +90,16 @@ class Measured(NamedTuple):
     psnr_masked: float
     psnr_outside: float
     psnr: float
+    dropped: float
+
+
+class Rendered(NamedTuple):
+    """A linear image, its seconds, its rays or samples a pixel, and its dropped throughput."""
+
+    linear: np.ndarray
+    seconds: float
+    count: float
+    dropped: float = 0.0
 
 
 class Other:
@@ -100,8 +114,8 @@ class Other:
         )
         self._file = Path(_OUT.value).resolve() / f"{name}.{'exr' if name == 'Cycles' else 'npy'}"
 
-    def __call__(self, view: View, samples: int, seed: int) -> tuple[np.ndarray, float]:
-        """Returns the linear image of a view, and its seconds.
+    def __call__(self, view: View, samples: int, seed: int) -> Rendered:
+        """Renders a view.
 
         Raises:
           OSError: if the process has ended.
@@ -112,7 +126,7 @@ class Other:
         self._process.stdin.flush()
         if not (answer := self._process.stdout.readline()):
             raise OSError(f"{self.name} ended; see {self.name}.log in {_OUT.value}.")
-        return _read(self._file), json.loads(answer)["seconds"]
+        return Rendered(_read(self._file), json.loads(answer)["seconds"], samples)
 
 
 def _read(file: Path) -> np.ndarray:
@@ -123,12 +137,24 @@ def _read(file: Path) -> np.ndarray:
     return channels["ViewLayer.Combined"][..., :3].astype(np.float32)
 
 
+def _with_blender_normals(part: MeshPart) -> MeshPart:
+    """Returns a part with the vertex normals of Blender and Mitsuba: averages by angle.
+
+    Those that the library computes respect creases and large flat pieces, so that light takes
+    other ways near the edges of a base.
+    """
+    groups = triangle_meshes.smooth_groups(part.vertices, part.faces, crease_angle=np.pi)
+    corners = part.vertices[part.faces]
+    flat, weights = triangle_meshes.face_normals(corners), triangle_meshes.corner_angles(corners)
+    return part._replace(normals=triangle_meshes.average_normals(flat, groups, weights))
+
+
 class Ours:
     """The path tree; compiled programs are kept."""
 
     def __init__(self, folder: Path):
         """Reads a scene."""
-        parts = meshes.read_meshes(folder)
+        parts = [_with_blender_normals(part) for part in meshes.read_meshes(folder)]
         parents = mesh_queries.find_containment(parts).parents
         self.scene = jax.device_put(scene_assembly.assemble_scene(parts, parents, rule="nested"))
         self.radiance = jax.device_put(radiance_of(scene_assembly.read_background(folder)))
@@ -144,8 +170,8 @@ class Ours:
         rays = cameras.image_rays(self.camera(view), 0)
         return np.isfinite(images.find_first_surface(self.scene.surfaces, rays).distances)
 
-    def __call__(self, view: View, choice: tuple) -> tuple[np.ndarray, float, float]:
-        """Returns the linear image of a view, its seconds, and the mean of its rays a pixel."""
+    def __call__(self, view: View, choice: tuple) -> Rendered:
+        """Renders a view with path settings, first and refined rays, and tolerance."""
         settings, first, refined, tolerance = choice
         begin = time.process_time()
         seen = render_known_camera(
@@ -158,7 +184,10 @@ class Ours:
             refined_rays_per_pixel=refined,
             tolerance=tolerance,
         )
-        return seen.linear, time.process_time() - begin, float(np.mean(seen.rays))
+        seconds = time.process_time() - begin
+        return Rendered(
+            seen.linear, seconds, float(np.mean(seen.rays)), float(np.mean(seen.dropped))
+        )
 
 
 def _prepare(source: Path) -> tuple[Path, list[View]]:
@@ -213,7 +242,7 @@ def _truth(cycles: Other, view: View) -> np.ndarray:
     name = f"truth_{view.folder.name}_{view.name}_{_SIZE.value}_{_TRUTH.value}.npy"
     file = Path(_OUT.value) / name
     if not file.exists():
-        halves = [cycles(view, _TRUTH.value // 2, seed)[0] for seed in (101, 102)]
+        halves = [cycles(view, _TRUTH.value // 2, seed).linear for seed in (101, 102)]
         np.save(file, np.stack(halves))
     return np.load(file)
 
@@ -221,20 +250,17 @@ def _truth(cycles: Other, view: View) -> np.ndarray:
 def _ways(folder: Path, others: list[Other]) -> dict[tuple[str, str], Callable]:
     """Returns renderers by name and number of samples: functions of a view and a seed."""
     ours = Ours(folder)
+    uniform = [(TREE, count, None, 0.0) for count in _UNIFORM]
     ways: dict[tuple[str, str], Callable] = {}
-    for name, settings in (("tree", TREE), ("tree 0.5 %", _FINE_TREE)):
-        choices = [(settings, count, None, 0.0) for count in _UNIFORM]
-        for choice in choices:
-            ways[name, str(choice[1])] = lambda view, _, choice=choice: ours(view, choice)
-        for first, refined, tolerance in _ADAPTIVE:
-            choice = (settings, first, refined, tolerance)
-            key = f"{name} adaptive", f"{first} to {refined} above {tolerance}"
-            ways[key] = lambda view, _, choice=choice: ours(view, choice)
+    for choice in (*uniform, *((TREE, *refined) for refined in _ADAPTIVE), (_FINE, *_ADAPTIVE[-1])):
+        settings, first, refined, _ = choice
+        name = _REFINED if settings == TREE else f"{_REFINED}, 0.5 %"
+        key = ("tree", str(first)) if refined is None else (name, f"{first} to {refined}")
+        ways[key] = lambda view, _, choice=choice: ours(view, choice)
     for other in others:
         for count in _SAMPLES:
-            ways[other.name, str(count)] = lambda view, seed, other=other, count=count: (
-                *other(view, count, seed),
-                float(count),
+            ways[other.name, str(count)] = lambda view, seed, other=other, count=count: other(
+                view, count, seed
             )
     return ways
 
@@ -242,65 +268,46 @@ def _ways(folder: Path, others: list[Other]) -> dict[tuple[str, str], Callable]:
 def _measure(
     folder: Path, views: list[View], truth: dict[str, np.ndarray], others: list[Other]
 ) -> list[Measured]:
-    """Renders all views of a scene by all renderers, in turn."""
-    images_of: dict[tuple, list] = {}
-    seconds: dict[tuple, list[list[float]]] = {}
-    first: dict[tuple, float] = {}
-    masks = [Ours(folder).mask(view) for view in views]
-    ways = _ways(folder, others)
+    """Renders all views of a scene by all renderers, in turn; returns the rows of the scene."""
+    ways, turns = _ways(folder, others), []
     for turn in range(_ROUNDS.value + 1):
+        # The first turn loads and compiles, for which one number of samples suffices elsewhere.
+        names = {other.name for other in others} if turn == 0 else set()
+        seen = {}
         for key, way in list(ways.items()):
-            if turn == 0 and key[0] in {other.name for other in others} and key[1] != "16":
-                continue  # only the first image of a scene needs more time
+            if key not in ways or (key[0] in names and key[1] != str(_SAMPLES[0])):
+                continue
             try:
-                results = [way(view, 1 + 10 * turn) for view in views]
+                seen[key] = [way(view, 1 + 10 * turn) for view in views]
             except OSError as error:
                 print(error, "It is omitted.", flush=True)
                 ways = {other: way for other, way in ways.items() if other[0] != key[0]}
-                break
-            if turn == 0:
-                first[key] = sum(result[1] for result in results)
-                continue
-            images_of[key] = results
-            seconds.setdefault(key, []).append([result[1] for result in results])
-    rows = []
+        turns.append(seen)
+    masks = [Ours(folder).mask(view) for view in views]
+    targets = [truth[view.name] for view in views]
+    rows, name = [], folder.name.rsplit("_", 1)[-1]
     for key in ways:
-        if key not in images_of:
-            continue
-        best = np.min(seconds[key], axis=0)
-        start = first.get(key, first.get((key[0], "16"), 0.0)) - (
-            float(np.sum(best)) if key in first else float(np.sum(np.min(seconds[key[0], "16"], 0)))
-        )
-        errors = np.mean(
-            [
-                _errors(result[0], truth[view.name].mean(axis=0), mask)
-                for view, mask, result in zip(views, masks, images_of[key], strict=True)
-            ],
-            axis=0,
-        )
-        samples = float(np.mean([result[2] for result in images_of[key]]))
-        rows.append(Measured(folder.name, *key, samples, float(np.mean(best)), start, *errors))
-    noise = np.mean(
-        [_errors(*truth[view.name], mask) for view, mask in zip(views, masks, strict=True)],
-        axis=0,
-    )
+        found = [turn[key] for turn in turns[1:]]
+        best = np.min([[result.seconds for result in turn] for turn in found], axis=0)
+        begun = turns[0].get(key)
+        start = sum(result.seconds for result in begun) - np.sum(best) if begun else np.nan
+        pairs = [(x.linear, y.mean(axis=0)) for x, y in zip(found[-1], targets, strict=True)]
+        count, dropped = (float(np.mean([x[field] for x in found[-1]])) for field in (2, 3))
+        errors = _mean_errors(pairs, masks)
+        rows.append(Measured(name, *key, count, float(np.mean(best)), start, *errors, dropped))
     # The mean of the halves has a quarter of the variance of their difference.
-    noise = noise + 10.0 * np.log10(4.0)
-    rows.append(
-        Measured(
-            folder.name,
-            "noise of the truth",
-            str(_TRUTH.value),
-            _TRUTH.value,
-            np.nan,
-            np.nan,
-            *noise,
-        )
-    )
-    _side_by_side(folder, truth, views, images_of)
+    noise = _mean_errors(targets, masks) + 10.0 * np.log10(4.0)
+    count = str(_TRUTH.value)
+    rows.append(Measured(name, _NOISE, count, _TRUTH.value, np.nan, np.nan, *noise, 0.0))
+    _side_by_side(folder, truth, views, turns[-1])
     for row in rows:
         print(*(f"{x:.3f}" if isinstance(x, float) else x for x in row), sep="  ", flush=True)
     return rows
+
+
+def _mean_errors(pairs: list, masks: list[np.ndarray]) -> np.ndarray:
+    """Returns the mean of `_errors` over views."""
+    return np.mean([_errors(*pair, mask) for pair, mask in zip(pairs, masks, strict=True)], axis=0)
 
 
 def _errors(linear: np.ndarray, target: np.ndarray, mask: np.ndarray) -> tuple[float, ...]:
@@ -318,7 +325,10 @@ def _side_by_side(
     last = {key[0]: results for key, results in images_of.items()}
     strips = []
     for number, view in enumerate(views):
-        row = [truth[view.name].mean(axis=0), *(results[number][0] for results in last.values())]
+        row = [
+            truth[view.name].mean(axis=0),
+            *(results[number].linear for results in last.values()),
+        ]
         strips.append(np.concatenate(row, axis=1))
     encoded = colours.linear_to_srgb(np.clip(np.concatenate(strips), 0.0, 1.0))
     big = np.kron(np.round(255.0 * encoded).astype(np.uint8), np.ones((2, 2, 1), np.uint8))
@@ -356,8 +366,30 @@ def _plot(file: Path, rows: list[Measured]) -> None:
     figure.savefig(file, dpi=110)
 
 
+def _gain(ours: Measured, theirs: list[Measured]) -> float:
+    """Returns our masked PSNR minus that of another renderer in the same seconds, in dB.
+
+    Its curve is interpolated over the logarithm of the seconds; where ours is faster than its first
+    point, that point counts.
+    """
+    theirs = sorted(theirs, key=lambda row: row.seconds)
+    seconds, psnr = ([getattr(row, key) for row in theirs] for key in ("seconds", "psnr_masked"))
+    return ours.psnr_masked - float(np.interp(np.log(ours.seconds), np.log(seconds), psnr))
+
+
 def _check(rows: list[Measured]) -> None:
-    pass
+    """Prints the gains of all points of the refined tree, and asserts the claim."""
+    missed = []
+    for scene in dict.fromkeys(row.scene for row in rows):
+        here = [row for row in rows if row.scene == scene]
+        for mine in (row for row in here if row.renderer == _REFINED):
+            for name in ("Cycles", "Mitsuba"):
+                if theirs := [row for row in here if row.renderer == name]:
+                    gain = _gain(mine, theirs)
+                    print(f"{scene}, {mine.samples}, {mine.seconds:.3f} s: {gain:+.1f} dB, {name}")
+                    if mine.mean_samples >= _LEAST_RAYS and gain < 0.0:
+                        missed.append((scene, mine.samples, name))
+    assert not missed, missed
 
 
 if __name__ == "__main__":
