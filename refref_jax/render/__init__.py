@@ -10,8 +10,10 @@ background (`radiance_of`): `render_known` renders it in tiles, and `shade` is t
 from refref_jax.geometry.rays import Rays as Rays
 from refref_jax.optics.path_settings import PATH_PRESETS as PATH_PRESETS
 from refref_jax.optics.path_settings import PathSettings as PathSettings
+from refref_jax.render.background_rendering import KnownImage as KnownImage
 from refref_jax.render.background_rendering import KnownRendering as KnownRendering
 from refref_jax.render.background_rendering import render_known as render_known
+from refref_jax.render.background_rendering import render_known_camera as render_known_camera
 from refref_jax.render.background_rendering import shade as shade
 from refref_jax.render.backgrounds import CubeBackground as CubeBackground
 from refref_jax.render.backgrounds import Environment as Environment

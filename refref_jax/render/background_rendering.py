@@ -21,6 +21,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax import numerics
+from refref_jax.choices import side_of
+from refref_jax.geometry import cameras as pinholes
+from refref_jax.geometry.cameras import Cameras
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import light_paths, path_tracing
 from refref_jax.optics.light_paths import LightPaths, PathEnds
@@ -59,6 +62,24 @@ class KnownRendering(NamedTuple):
     linear: Float[np.ndarray, "*rays 3"]
     paths: Int[np.ndarray, "*rays"]
     dropped: Float[np.ndarray, "*rays 3"]
+    casts: int
+
+
+class KnownImage(NamedTuple):
+    """A rendered image, each of whose pixels is the mean over its rays.
+
+    Attributes:
+      rgb: sRGB colours in `[0, 1]`.
+      linear: linear RGB colours, not clipped.
+      rays: number of rays that each pixel is the mean of.
+      dropped: dropped throughput, as in `KnownRendering`, mean over those rays.
+      casts: total number of closest-hit queries, with those of replaced rays.
+    """
+
+    rgb: Float[np.ndarray, "h w 3"]
+    linear: Float[np.ndarray, "h w 3"]
+    rays: Int[np.ndarray, "h w"]
+    dropped: Float[np.ndarray, "h w 3"]
     casts: int
 
 
@@ -112,12 +133,10 @@ def render_known(
     """
     if tile < 1:
         raise ValueError(f"tile is {tile}, but a tile needs rays. Give 1 or more.")
-    if jax.tree_util.all_leaves([radiance]):
-        radiance = jax.tree_util.Partial(radiance)  # a plain function cannot be an argument of jit
     count = rays.radii.size
     tile = images.size_for(count, most=tile)
     # Transferred to the device once, not once per tile.
-    scene, radiance = jax.device_put((scene, radiance))
+    scene, radiance = jax.device_put((scene, _as_argument(radiance)))
     casts = []
 
     def see(
@@ -134,6 +153,84 @@ def render_known(
         see, rays, tile=tile, nothing=_blank()[:-1], instead=_INSTEAD, interior_list=interior_list
     )
     return KnownRendering(*fields, sum(casts))
+
+
+def render_known_camera(
+    scene: Scene,
+    radiance: Radiance,
+    cameras: Cameras,
+    view: int,
+    *,
+    settings: PathSettings,
+    rays_per_pixel: int = 4,
+    refined_rays_per_pixel: int | None = None,
+    tolerance: float = 0.1,
+    interior_list: Int[np.ndarray, " slots"] | None = None,
+    tile: int = TILE,
+) -> KnownImage:
+    """Renders one camera's image in front of a known background, with several rays in every pixel.
+
+    With `refined_rays_per_pixel`, a pixel is rendered again with that many rays, which replace the
+    first ones, if one of its rays and the eight rays around it, some of them of the next pixels,
+    differ by more than `tolerance`. So edges, silhouettes and places where glass shrinks the
+    background get many rays, and smooth places few.
+
+    Args:
+      scene: the scene.
+      radiance: function of origin and direction that returns the background's linear RGB.
+      cameras: cameras with the resolution of the image.
+      view: index of the camera.
+      settings: path settings.
+      rays_per_pixel: number of rays in each pixel, a square: 1, 4, 9, 16.
+      refined_rays_per_pixel: number of rays in the pixels above the tolerance, a larger square;
+        every pixel has `rays_per_pixel` by default.
+      tolerance: difference between the largest and the smallest sRGB value in `[0, 1]` of
+        neighbouring rays, in the worst channel, up to which a pixel is not refined.
+      interior_list: interior list of the camera's position, see `render_known`.
+      tile: number of rays traced at once, see `render_known`.
+
+    Raises:
+      ValueError: if a number of rays is not a square, the refined number is not larger, the
+        tolerance is negative, or `render_known` rejects its arguments.
+      TypeError: if it is called in a function that JAX transforms.
+
+    Example:
+      >>> import trimesh
+      >>> import refref_jax
+      >>> from refref_jax.render import render_known_camera
+      >>> glass = refref_jax.single_object(trimesh.creation.box(), index=1.5)
+      >>> camera = refref_jax.orbit(1, distance=4.0, elevation=0.3, size=8, angle_x=1.2)
+      >>> sky = lambda origin, direction: 0.5 + 0.5 * direction
+      >>> settings = refref_jax.PATH_PRESETS["tree"]
+      >>> image = render_known_camera(
+      ...     glass, sky, camera, 0, settings=settings, refined_rays_per_pixel=16
+      ... )
+      >>> image.rgb.shape, sorted(set(image.rays.ravel().tolist()))
+      ((8, 8, 3), [4, 16])
+    """
+    _check_refinement(rays_per_pixel, refined_rays_per_pixel, tolerance)
+    scene, radiance = jax.device_put((scene, _as_argument(radiance)))
+
+    def see(row: np.ndarray, column: np.ndarray, count: int) -> KnownRendering:
+        rays = _rays_of_pixels(cameras, view, row, column, side_of(count))
+        listed = interior_list
+        if listed is not None:
+            listed = np.broadcast_to(listed, (*rays.radii.shape, *listed.shape))
+        return render_known(
+            scene, radiance, rays, settings=settings, interior_list=listed, tile=tile
+        )
+
+    row, column = np.indices((cameras.height, cameras.width))
+    seen = see(row, column, rays_per_pixel)
+    casts, rays = seen.casts, np.full(row.shape, rays_per_pixel, np.int32)
+    linear, dropped = seen.linear.mean(axis=2), seen.dropped.mean(axis=2)
+    if refined_rays_per_pixel is not None:
+        again = _contrast(seen.rgb) > tolerance
+        finer = see(row[again], column[again], refined_rays_per_pixel)
+        casts, rays[again] = casts + finer.casts, refined_rays_per_pixel
+        linear[again], dropped[again] = finer.linear.mean(axis=1), finer.dropped.mean(axis=1)
+    rgb = np.clip(np.asarray(pixels.linear_to_srgb(jax.device_put(linear))), 0.0, 1.0)
+    return KnownImage(rgb, linear, rays, dropped, casts)
 
 
 def shade(paths: LightPaths | PathEnds, radiance: Radiance, *, rays: int) -> Float[Array, "rays 3"]:
@@ -177,6 +274,59 @@ def shade(paths: LightPaths | PathEnds, radiance: Radiance, *, rays: int) -> Flo
     held = jnp.where(exists, jnp.arange(exists.shape[0], dtype=jnp.int32), 0)
     ends = jax.tree.map(lambda x: x[held], ends)
     return jax.ops.segment_sum(_light(radiance, ends, exists), ends.rays, num_segments=rays)
+
+
+def _as_argument(radiance: Radiance) -> Radiance:
+    """Returns a radiance function as a pytree: a plain function cannot be an argument of jit."""
+    plain = jax.tree_util.all_leaves([radiance])
+    return jax.tree_util.Partial(radiance) if plain else radiance
+
+
+def _check_refinement(count: int, refined: int | None, tolerance: float) -> None:
+    for number in (count, refined):
+        if number is not None:
+            side_of(number)
+    if not tolerance >= 0.0:
+        raise ValueError(f"tolerance is {tolerance}. Give 0 or more.")
+    if refined is not None and not count < refined:
+        raise ValueError(
+            f"refined_rays_per_pixel is {refined}, not more than rays_per_pixel, {count}. Give a "
+            "larger square, or None."
+        )
+
+
+def _rays_of_pixels(
+    cameras: Cameras,
+    view: int,
+    row: Int[np.ndarray, "*pixels"],
+    column: Int[np.ndarray, "*pixels"],
+    side: int,
+) -> Rays:
+    """Returns the `side * side` rays of some pixels, as `[*pixels, rays]`, row by row."""
+    down, along = (x.ravel() for x in np.indices((side, side)))
+    fine_row, fine_column = side * row[..., None] + down, side * column[..., None] + along
+    fine = pinholes.supersample(cameras, side)
+    rays = pinholes.pixel_rays(fine, np.full(fine_row.shape, view), fine_row, fine_column)
+    pixel = np.broadcast_to((row * cameras.width + column)[..., None], fine_row.shape)
+    subpixel = np.broadcast_to(np.arange(side**2), fine_row.shape)
+    strata = np.stack([pixel, subpixel, np.full(fine_row.shape, side**2)], axis=-1)
+    return rays._replace(strata=numerics.host_array(strata.astype(np.int32)))
+
+
+def _contrast(rgb: Float[np.ndarray, "h w rays 3"]) -> Float[np.ndarray, "h w"]:
+    """Returns the largest range of any ray of a pixel and its neighbours, in any channel."""
+    height, width, count, _ = rgb.shape
+    side = side_of(count)
+    fine = rgb.reshape(height, width, side, side, 3).swapaxes(1, 2)
+    fine = np.pad(fine.reshape(side * height, side * width, 3), ((1, 1), (1, 1), (0, 0)), "edge")
+    high, low = fine, fine
+    for axis in (0, 1):
+        high, low = (
+            combine.reduce(np.lib.stride_tricks.sliding_window_view(x, 3, axis), axis=-1)
+            for combine, x in ((np.maximum, high), (np.minimum, low))
+        )
+    spread = np.max(high - low, axis=-1)
+    return spread.reshape(height, side, width, side).max(axis=(1, 3))
 
 
 def _blank() -> KnownRendering:

@@ -4,13 +4,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.ndimage import maximum_filter, minimum_filter
 
 import refref_jax
 from benchmarks.oracles import colours
 from refref_jax.data.mesh_queries import parts_around
+from refref_jax.geometry import cameras
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics.path_settings import PAPER, STRAIGHT, TREE
-from refref_jax.render import background_rendering, radiance_of, render_known
+from refref_jax.render import (
+    background_rendering,
+    radiance_of,
+    render_known,
+    render_known_camera,
+)
 from refref_jax.render.backgrounds import (
     CubeBackground,
     Environment,
@@ -186,3 +193,90 @@ def test_a_scene_that_is_moved_as_a_whole_gives_the_same_image(rays, kind):
         scenes.build(_BALL), radiance_of(background), rays, settings=PAPER, tile=256
     )
     np.testing.assert_allclose(images[0], still.linear, atol=1e-6)
+
+
+_CAMERA = cameras.orbit(2, distance=4.0, elevation=0.3, size=12, angle_x=0.9)
+
+
+def _uniform(scene, radiance, side, view=0):
+    rays = cameras.image_rays(cameras.supersample(_CAMERA, side), view)
+    seen = render_known(scene, radiance, rays, settings=TREE)
+    return cameras.box_filter(seen.linear, side), seen.casts
+
+
+def _image(scene, radiance, *, view=0, **options):
+    return render_known_camera(scene, radiance, _CAMERA, view, settings=TREE, **options)
+
+
+@pytest.mark.parametrize("view", [0, 1])
+def test_a_pixel_is_the_mean_of_its_rays(scene, view):
+    seen = _image(scene, _environment(), view=view)
+    expected, casts = _uniform(scene, _environment(), 2, view)
+    np.testing.assert_allclose(seen.linear, expected, atol=1e-5)
+    srgb = np.clip(colours.linear_to_srgb(seen.linear), 0.0, 1.0)
+    np.testing.assert_allclose(seen.rgb, srgb, atol=1e-6)
+    assert seen.casts == casts and np.all(seen.rays == 4) and np.all(seen.dropped == 0.0)
+
+
+def _stripes(origin, direction):
+    return jnp.where(jnp.sin(4.0 * direction[2]) > 0.0, 0.9, 0.1) + 0.0 * origin
+
+
+def test_pixels_whose_rays_differ_from_neighbours_get_more_rays(scene):
+    seen = _image(scene, _stripes, refined_rays_per_pixel=25, tolerance=0.2)
+    rays = cameras.image_rays(cameras.supersample(_CAMERA, 2), 0)
+    first = render_known(scene, _stripes, rays, settings=TREE).rgb
+    high, low = (f(first, (3, 3, 1), mode="nearest") for f in (maximum_filter, minimum_filter))
+    contrast = (high - low).reshape(12, 2, 12, 2, 3).max(axis=(1, 3, 4))
+    clear = np.abs(contrast - 0.2) > 1e-5  # of rounding
+    np.testing.assert_array_equal((seen.rays == 25)[clear], (contrast > 0.2)[clear])
+    assert set(np.unique(seen.rays)) == {4, 25}
+    few, many = _uniform(scene, _stripes, 2)[0], _uniform(scene, _stripes, 5)[0]
+    expected = np.where(seen.rays[..., None] == 4, few, many)
+    np.testing.assert_allclose(seen.linear, expected, atol=1e-5)
+
+
+def test_refined_pixels_are_nearer_to_the_truth_than_more_rays_everywhere(scene):
+    truth, _ = _uniform(scene, _stripes, 24)
+    seen = _image(scene, _stripes, refined_rays_per_pixel=36, tolerance=0.2)
+    traced = np.mean(seen.rays + 4.0 * (seen.rays > 4))
+    assert traced < 25.0
+    error, uniform = (
+        np.sqrt(np.mean((x - truth) ** 2)) for x in (seen.linear, _uniform(scene, _stripes, 5)[0])
+    )
+    assert error < uniform
+
+
+def test_white_is_not_refined_and_zero_tolerance_refines_what_differs(scene):
+    assert np.all(_image(scene, _WHITE, refined_rays_per_pixel=9).rays == 4)
+    seen = _image(scene, _environment(), refined_rays_per_pixel=9, tolerance=0.0)
+    assert np.all(seen.rays == 9)
+    np.testing.assert_allclose(seen.linear, _uniform(scene, _environment(), 3)[0], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"rays_per_pixel": 5}, "square grid"),
+        ({"refined_rays_per_pixel": 5}, "square grid"),
+        ({"rays_per_pixel": 9, "refined_rays_per_pixel": 9}, "refined_rays_per_pixel is 9"),
+        ({"rays_per_pixel": 9, "refined_rays_per_pixel": 4}, "refined_rays_per_pixel is 4"),
+        ({"refined_rays_per_pixel": 9, "tolerance": -0.1}, "tolerance is -0.1"),
+        ({"refined_rays_per_pixel": 9, "tolerance": float("nan")}, "tolerance is nan"),
+    ],
+)
+def test_impossible_numbers_of_rays_are_refused(scene, options, message):
+    with pytest.raises(ValueError, match=message):
+        _image(scene, _WHITE, **options)
+
+
+def test_a_camera_inside_an_object_has_its_interior_list():
+    scene = scenes.build(_BALL, rule="priority")
+    here = _CAMERA._replace(poses=_CAMERA.poses * np.float32([1.0, 1.0, 1.0, 0.0]))
+    inside = parts_around([_BALL], np.zeros((1, 3)))[0]
+    settings = dataclasses.replace(TREE, reflections="none")
+    seen = render_known_camera(
+        scene, lambda o, d: d + 2.0, here, 0, settings=settings, interior_list=inside
+    )
+    expected = cameras.box_filter(cameras.image_rays(cameras.supersample(here, 2), 0).directions, 2)
+    np.testing.assert_allclose(seen.linear, expected + 2.0, atol=0.05)
