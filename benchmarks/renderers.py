@@ -23,6 +23,7 @@ import os
 if hasattr(os, "sched_setaffinity"):
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
 
+import contextlib
 import csv
 import dataclasses
 import json
@@ -110,22 +111,29 @@ class Other:
         """Starts the process."""
         self.name = name
         log = (Path(_OUT.value) / f"{name}.log").open("w")
-        self._process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True
-        )
+        self._process = None
+        if shutil.which(command[0]):
+            self._process = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True
+            )
         self._file = Path(_OUT.value).resolve() / f"{name}.{'exr' if name == 'Cycles' else 'npy'}"
 
     def __call__(self, view: View, samples: int, seed: int) -> Rendered:
         """Renders a view.
 
         Raises:
-          OSError: if the process has ended.
+          OSError: if the process has ended, or never started.
         """
+        if self._process is None:
+            raise OSError(f"{self.name} is not installed.")
         job = {"scene": str(view.folder), "pose": view.pose, "angle_x": view.angle_x}
         job |= {"samples": samples, "seed": seed, "file": str(self._file)}
-        self._process.stdin.write(json.dumps(job) + "\n")
-        self._process.stdin.flush()
-        if not (answer := self._process.stdout.readline()):
+        answer = ""
+        with contextlib.suppress(BrokenPipeError):
+            self._process.stdin.write(json.dumps(job) + "\n")
+            self._process.stdin.flush()
+            answer = self._process.stdout.readline()
+        if not answer:
             raise OSError(f"{self.name} ended; see {self.name}.log in {_OUT.value}.")
         return Rendered(_read(self._file), json.loads(answer)["seconds"], samples)
 
@@ -243,6 +251,7 @@ def _truth(cycles: Other, view: View) -> np.ndarray:
     name = f"truth_{view.folder.name}_{view.name}_{_SIZE.value}_{_TRUTH.value}.npy"
     file = Path(_OUT.value) / name
     if not file.exists():
+        print(f"Rendering {name} in Cycles, without which there is no truth.", flush=True)
         halves = [cycles(view, _TRUTH.value // 2, seed).linear for seed in (101, 102)]
         np.save(file, np.stack(halves))
     return np.load(file)
