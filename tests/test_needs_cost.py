@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax import extend
 
 from refref_jax.choices import Material
 from refref_jax.data import mesh_queries, meshes, scene_folder
@@ -101,18 +100,10 @@ def test_bounded_space_is_not_contracted(monkeypatch):
 def _carried_lists(scene):
     """Returns the shapes of all interior lists that the tracer's loops carry."""
     traced = functools.partial(path_tracing.trace_ends, settings=TREE)
-    shapes = []
-
-    def visit(jaxpr):
-        for equation in jaxpr.eqns:
-            if equation.primitive.name == "while":
-                shapes.extend(variable.aval for variable in equation.outvars)
-            for inner in extend.core.jaxprs_in_params(equation.params):
-                visit(inner)
-
-    visit(jax.make_jaxpr(traced)(scene, _RAYS).jaxpr)
-    integers = [shape.shape for shape in shapes if shape.dtype == jnp.int32]
-    return [shape for shape in integers if len(shape) == 2]
+    text = jax.jit(traced).lower(scene, _RAYS).as_text()
+    loops = [line.rsplit(" : ", 1)[1] for line in text.splitlines() if "stablehlo.while" in line]
+    found = re.findall(r"tensor<(\d+)x(\d+)xi32>", "\n".join(loops))
+    return [(int(rays), int(columns)) for rays, columns in found]
 
 
 def test_only_overlapping_bodies_make_rays_carry_lists():

@@ -55,7 +55,7 @@ def test_before_its_first_step_a_training_ends_with_nothing_saved(tmp_path, monk
         (fit.checkpoint_io, "read_static"),
         (fit.checkpoint_io, "load_scene"),
         (fit.scene_source, "open_scene"),
-        (fit, "_sampler"),
+        (fit, "read_pixels"),
         (fit, "_report_misses"),
         (fit, "init_state"),
         (fit.devices, "put_everywhere"),
