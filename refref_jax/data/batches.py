@@ -88,6 +88,7 @@ class PixelSampler:
         self._seed = seed
         self._batch = batch
         self.batches = -(-len(places) // batch)
+        self._kept = None if kept is None else places
         self._order = self._generator(0).permutation(places).astype(np.uint32)
 
     def numbers(self, first: int, steps: int) -> Int[np.ndarray, " steps"]:
@@ -106,8 +107,9 @@ class PixelSampler:
         return self.look_up(self._order[place % len(self._order)].astype(np.int64))
 
     def survey(self, count: int) -> PixelBatch:
-        """Returns `count` pixels drawn at random, always the same ones."""
-        return self.look_up(np.random.default_rng(0).integers(len(self._pixels), size=count))
+        """Returns `count` of the pixels to draw from, at random, always the same ones."""
+        drawn = np.random.default_rng(0).integers(len(self._order), size=count)
+        return self.look_up(drawn if self._kept is None else self._kept[drawn])
 
     def look_up(self, index: Int[np.ndarray, "*shape"]) -> PixelBatch:
         """Returns pixels by their index in the flattened images."""

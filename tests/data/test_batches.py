@@ -122,6 +122,8 @@ def test_only_kept_pixels_are_drawn():
     assert sampler.batches == 3
     seen = _numbers(_draw(sampler, 0, sampler.batches))
     np.testing.assert_array_equal(np.unique(seen), np.flatnonzero(kept))
+    surveyed = np.unique(_numbers(sampler.survey(200)))
+    np.testing.assert_array_equal(surveyed, np.flatnonzero(kept))
 
 
 def test_too_few_kept_pixels_are_refused():
