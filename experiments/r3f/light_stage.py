@@ -26,7 +26,7 @@ from jaxtyping import Float
 
 from experiments.cli.progress import ProgressBar
 from experiments.r3f import index_stage, light_figures
-from experiments.r3f.records import IndexFacts, LightFacts, PartFacts, TrialFacts
+from experiments.r3f.records import UNEXPLAINED, IndexFacts, LightFacts, PartFacts, TrialFacts
 from refref_jax import atomic_files
 from refref_jax.choices import CLEAR, Split
 from refref_jax.data import meshes, scene_folder
@@ -68,9 +68,9 @@ _JUDGES, _ONE_IN = 16_384, 8
 # Most pixels that steps draw from.
 _FITTED = 2_000_000
 
-# Error of pixels through solid glass above which something may be inside, sRGB, and largest rms
-# distance of the surface from a body of revolution, as a share of its diameter.
-_UNEXPLAINED, _FURTHEST = 0.05, 0.03
+# Largest rms distance of the surface from a body of revolution for which something may be inside,
+# as a share of its diameter.
+_FURTHEST = 0.03
 
 # Materials that name the files of parts, with their indices.
 _MATERIALS = [
@@ -374,7 +374,7 @@ def _may_be_vessel(outer: Revolution | None, trials: Sequence[Trial]) -> bool:
 
 
 def _is_unexplained(trials: Sequence[Trial]) -> bool:
-    return min(trial.error for trial in trials) > _UNEXPLAINED
+    return min(trial.error for trial in trials) > UNEXPLAINED
 
 
 def _free_vessels(

@@ -23,6 +23,9 @@ FILE = "reconstruction.json"
 Refinement = Literal["light", "none"]
 """What refines the surface from masks."""
 
+UNEXPLAINED = 0.05
+"""Error of the judges, sRGB, above which a shape leaves something unexplained."""
+
 # Error of the judges above which no model has explained the object, sRGB.
 _DOUBTFUL = 0.06
 
@@ -186,6 +189,11 @@ class LightFacts:
     parts: tuple[PartFacts, ...] = ()
     steps: int | None = None
     furthest: float | None = None
+
+    @property
+    def leaves_error(self) -> bool:
+        """Whether the shape leaves an error that a field inside the object reduces."""
+        return self.after is not None and self.after > UNEXPLAINED
 
     @property
     def doubt(self) -> str:

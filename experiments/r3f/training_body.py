@@ -202,6 +202,9 @@ def with_parts(
 ) -> TrainConfig:
     """Returns a configuration that uses a reconstructed object.
 
+    If its reconstruction leaves an error, a field inside the object learns what its shape does not
+    explain, unless another interior is given.
+
     Args:
       config: configuration, with the folder of the scene.
       parts: parts of the reconstructed object.
@@ -216,8 +219,24 @@ def with_parts(
         config = config.decided(reconstruction=folder)
     else:
         config = config_flags.on_top(config, {"reconstruction": folder}, say=say)
+    if config.model.interior is None and (why := _unexplained(made)):
+        say(why)
+        config = config.decided(interior="field")
     is_given = given_index(ior) is not None
     return config.override(ior=index) if is_given else config.decided(ior=index)
+
+
+def _unexplained(made: Path) -> str:
+    """Returns why the inside of an object is a field; empty if its shape explains the images."""
+    from experiments.r3f import records
+
+    light = records.read(made).light
+    if light is None or light.after is None or not light.leaves_error:
+        return ""
+    return (
+        f"interior=field: the shape leaves an error of {light.after:.4f}, and a field inside the "
+        "object learns a part of it; --interior=absorbing leaves it out and is faster"
+    )
 
 
 def note(run: Path, parts: Sequence[MeshPart] | None, given: str) -> None:

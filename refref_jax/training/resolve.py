@@ -387,7 +387,8 @@ def _choose_far_field(
     config: TrainConfig, facts: SceneFacts, needs: Sequence[str]
 ) -> tuple[choices.FarField, str]:
     """Returns the model of the far field, and the reason for it."""
-    if needs or (config.model.interior == "field" and config.paths.max_bends):
+    asked = config.model.interior == "field" and "interior" in config.overrides()
+    if needs or (asked and config.paths.max_bends):
         return "field", f"the scene needs a field: {[*needs, *_in_front(config, facts)][0]}"
     given = [name for name in (*BACKDROP_ONLY, *FIELD_ONLY) if name in config.overrides()]
     if given:

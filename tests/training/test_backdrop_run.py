@@ -72,6 +72,15 @@ def test_the_scene_alone_chooses_the_backdrop(scene, tmp_path):
         assert "preset=tiny" in other.describe()
 
 
+def test_a_field_inside_that_is_a_decision_keeps_the_backdrop(scene):
+    asked = TrainConfig().override(scene=str(scene))
+    decided, _ = prepare(asked.decided(interior="field"), report=lambda line: None)
+    assert decided.config.model.far_field == "backdrop"
+    assert decided.model.config.interior == "field" and "preset=tiny" in decided.describe()
+    given, _ = prepare(asked.override(interior="field"), report=lambda line: None)
+    assert given.config.model.far_field == "field"
+
+
 def test_images_without_a_pixel_of_background_are_refused(scene, tmp_path):
     copy = shutil.copytree(scene, tmp_path / "scene")
     for path in scene_folder.read_frames(copy, "train").masks:

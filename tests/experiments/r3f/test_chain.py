@@ -19,6 +19,7 @@ from experiments.r3f import (
     object_source,
     records,
     report,
+    training_body,
 )
 from experiments.r3f.records import ReconstructionConfig
 from refref_jax.data import meshes, scene_folder
@@ -34,6 +35,7 @@ from refref_jax.reconstruct.opaque_ends import OpaqueEnd
 from refref_jax.reconstruct.refractive_index import Descent, IndexEstimate
 from refref_jax.reconstruct.shape_from_refraction import SingleObject
 from refref_jax.reconstruct.shapes import FixedShape, mesh_of
+from refref_jax.training.config import TrainConfig
 from tests.factories import bodies, scenes, vessels
 from tests.factories.silhouettes import RADIUS, without_masks, write_scene
 
@@ -467,6 +469,24 @@ def test_an_object_that_no_model_explains_is_told(after, doubted):
     assert ("warning: an error of 0.0900 is left" in line) == doubted
     found = dataclasses.replace(records.Reconstruction("ball", "", _CONFIG), light=facts)
     assert any("straight rays" in part for part in report._of_light(found)) == doubted
+
+
+@pytest.mark.parametrize(
+    ("after", "given", "interior"),
+    [(0.03, None, None), (0.07, None, "field"), (0.07, "clear", "clear"), (None, None, None)],
+)
+def test_a_field_inside_learns_what_a_shape_leaves_unexplained(
+    whole, tmp_path, after, given, interior
+):
+    made, said = tmp_path / "made", []
+    shutil.copytree(whole, made)
+    light = records.LightFacts(kept=True, index=1.5, before=0.11, after=after)
+    records.write(made, dataclasses.replace(records.read(made), light=light))
+    config = TrainConfig().override(**({"interior": given} if given else {}))
+    parts = [scenes.ball(1.0, subdivisions=1)]
+    config = training_body.with_parts(config, parts, made, ior=(), say=said.append)
+    assert config.model.interior == interior
+    assert any("error of 0.0700" in line for line in said) == (interior == "field")
 
 
 def test_before_a_field_there_is_no_refinement_by_light(scene, whole, tmp_path, monkeypatch):
