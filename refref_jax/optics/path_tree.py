@@ -35,7 +35,8 @@ class Segments(NamedTuple):
     """A list of path segments; the first ones are the camera rays.
 
     Attributes:
-      parents: index of the parent segment, `NO_SEGMENT` for a camera ray.
+      parents: index of the parent segment, `NO_SEGMENT` for a camera ray; `None`, like `parts`, in
+        a list of last segments.
       points: start of the segment, world units.
       directions: unit direction.
       tau: arc length from the camera to the start.
@@ -44,12 +45,12 @@ class Segments(NamedTuple):
       differentials: ray differential of the segment (see `ray_differentials`).
     """
 
-    parents: Int[Array, " segments"]
+    parents: Int[Array, " segments"] | None
     points: Float[Array, "segments 3"]
     directions: Float[Array, "segments 3"]
     tau: Float[Array, " segments"]
     media: Int[Array, " segments"]
-    parts: Int[Array, " segments"]
+    parts: Int[Array, " segments"] | None
     differentials: RayDifferential
 
 
@@ -57,12 +58,13 @@ class Ends(NamedTuple):
     """The ends of paths.
 
     Attributes:
-      segments: index of the last segment.
+      segments: index of the last segment; meaningless if segments are not stored.
       rays: index of the camera ray.
       throughput: share of the ray's linear RGB that the path carries.
       num_bends: number of bends.
       statuses: `PathStatus` of each path.
       stop: ends on opaque surfaces, `None` without such surfaces.
+      last: last segments, if segments are not stored.
     """
 
     segments: Int[Array, " paths"]
@@ -71,13 +73,14 @@ class Ends(NamedTuple):
     num_bends: Int[Array, " paths"]
     statuses: Int[Array, " paths"]
     stop: Stop | None = None
+    last: Segments | None = None
 
 
 class PathTree(NamedTuple):
     """All paths of the rays that are traced together.
 
     Attributes:
-      segments: list of `Segments`.
+      segments: list of `Segments`; only their number, if they are not stored.
       ends: list of `Ends`, one per path.
       dropped: dropped throughput of each ray, linear RGB.
       casts: number of rays that were cast.
@@ -118,12 +121,22 @@ def emptied(ends: Ends, empty: Bool[Array, " paths"], home: Int[Array, " paths"]
         num_bends=jnp.where(empty, 0, ends.num_bends),
         statuses=jnp.where(empty, PathStatus.EMPTY, ends.statuses).astype(jnp.int32),
         stop=ends.stop and ends.stop._replace(tau=jnp.where(empty, jnp.inf, ends.stop.tau)),
+        last=ends.last and _first_where(empty, ends.last),
     )
 
 
-def last_segments(segments: Segments, ends: Ends) -> PathEnds:
+def _first_where(empty: Bool[Array, " paths"], last: Segments) -> Segments:
+    """Returns last segments with that of the first path in empty slots: finite, if meaningless."""
+
+    def choose(x: Array) -> Array:
+        return jnp.where(empty.reshape(-1, *[1] * (x.ndim - 1)), x[:1], x)
+
+    return jax.tree.map(choose, last)
+
+
+def last_segments(segments: Segments | None, ends: Ends) -> PathEnds:
     """Returns the last segment of each path."""
-    last = jax.tree.map(lambda x: x[ends.segments], segments)
+    last = ends.last or jax.tree.map(lambda x: x[ends.segments], segments)
     return PathEnds(
         origins=last.points,
         directions=last.directions,

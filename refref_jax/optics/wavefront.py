@@ -54,11 +54,13 @@ class Live(NamedTuple):
       state: states of the rays.
       rays: index of each one's camera ray.
       segments: index of each one's current segment.
+      media: medium of the current segment; `None` if segments are stored.
     """
 
     state: RayState
     rays: Int[Array, " live"]
     segments: Int[Array, " live"]
+    media: Int[Array, " live"] | None = None
 
     @property
     def throughput(self) -> Float[Array, "live 3"]:
@@ -101,7 +103,10 @@ def children_of(
         traced &= mediums != media.AMBIENT
     return Children(
         live=Live(
-            states, queues.join(live.rays, live.rays), queues.join(live.segments, live.segments)
+            states,
+            queues.join(live.rays, live.rays),
+            queues.join(live.segments, live.segments),
+            None if live.media is None else mediums,
         ),
         media=mediums,
         parts=queues.join(sides.part, sides.part),
@@ -113,25 +118,36 @@ def children_of(
 def store_segments(
     tree: PathTree, children: Children, capacities: Capacities
 ) -> tuple[PathTree, Children]:
-    """Stores the segments of children; drops the weakest children if the buffer is full."""
+    """Stores the segments of children; drops the weakest children if the buffer is full.
+
+    Without stored segments only their number counts, with the same limit.
+    """
     live = children.live
     left = capacities.segments - tree.segments.count
     kept = queues.strongest(children.exists, jnp.max(live.throughput, axis=-1), left)
     index = tree.segments.count + jnp.cumsum(kept, dtype=jnp.int32) - 1
-    state = live.state
-    logged = Segments(
-        live.segments,
-        state.point,
-        state.direction,
-        state.tau,
-        children.media,
-        children.parts,
-        state.differential,
-    )
-    log = queues.append(tree.segments, logged, kept)
+    state, log = live.state, tree.segments
+    logged = None if log.items is None else _segments(live, children.media, children.parts)
+    log = queues.append(log, logged, kept)
     dropped = queues.add_dropped(tree.dropped, live.rays, live.throughput, children.exists & ~kept)
     children = children._replace(live=live._replace(segments=index), exists=kept)
     return tree._replace(segments=log, dropped=dropped), children
+
+
+def _segments(
+    live: Live, medium: Int[Array, " n"], parts: Int[Array, " n"] | None = None
+) -> Segments:
+    """Returns the current segments of rays; without parts and parents, if they are not stored."""
+    state = live.state
+    return Segments(
+        None if parts is None else live.segments,
+        state.point,
+        state.direction,
+        state.tau,
+        medium,
+        parts,
+        state.differential,
+    )
 
 
 def push_or_end(
@@ -179,7 +195,10 @@ def end(
     if like is not None and stop is None:
         tau = jnp.full_like(live.state.tau, jnp.inf)
         stop = Stop(tau, None if like.radiance is None else jnp.zeros_like(live.throughput))
-    block = Ends(live.segments, live.rays, live.throughput, live.state.num_bends, status, stop)
+    last = None if live.media is None else _segments(live, live.media)
+    block = Ends(
+        live.segments, live.rays, live.throughput, live.state.num_bends, status, stop, last
+    )
     return tree._replace(ends=queues.append(tree.ends, block, ending))
 
 
@@ -205,6 +224,7 @@ def follow(
     settings: PathSettings,
     footprint: Footprint = "cone",
     block: int | None = None,
+    stored: bool = True,
 ) -> PathTree:
     """Traces each ray along all branches; every child has one bend more than its parent.
 
@@ -216,46 +236,56 @@ def follow(
       settings: path settings, with at least one bend.
       footprint: `differential` carries derivatives across the pixel.
       block: number of rays cast per iteration; by default what suits the platform.
+      stored: whether segments are stored; otherwise only the last one of each path.
     """
-    return _follow(settings, footprint, block, scene, rays, interior_list)
+    return _follow(settings, footprint, block, stored, scene, rays, interior_list)
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2))
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2, 3))
 def _follow(
     settings: PathSettings,
     footprint: Footprint,
     block: int | None,
+    stored: bool,
     scene: Scene,
     rays: Rays,
     interior_list: Int[Array, "rays slots"],
 ) -> PathTree:
+    kind = _Kind(settings, footprint, stored)
     if block is not None:
-        return _in_blocks(scene, rays, interior_list, settings, footprint, block)
-    return _as_platform_likes(scene, rays, interior_list, settings=settings, footprint=footprint)
+        return _in_blocks(scene, rays, interior_list, kind, block)
+    return _as_platform_likes(scene, rays, interior_list, kind=kind)
+
+
+class _Kind(NamedTuple):
+    """What is traced, and what is kept of it; arguments of `follow`."""
+
+    settings: PathSettings
+    footprint: Footprint
+    stored: bool = True
 
 
 def _in_blocks(
     scene: Scene,
     rays: Rays,
     interior_list: Int[Array, "rays slots"],
-    settings: PathSettings,
-    footprint: Footprint,
+    kind: _Kind,
     block: int,
 ) -> PathTree:
     count = rays.radii.shape[0]
     block = max(1, min(block, count))
-    capacities = path_settings.capacities(settings, count)
-    walk = _begin(scene, rays, interior_list, footprint, block, capacities)
+    capacities = path_settings.capacities(kind.settings, count)
+    walk = _begin(scene, rays, interior_list, kind, block, capacities)
     if count < _MANY_BLOCKS * block or block < _SMALLER:
-        return _trace_remaining(scene, walk, settings, block, capacities, least=1).tree
+        return _trace_remaining(scene, walk, kind.settings, block, capacities, least=1).tree
     # Otherwise the few deepest rays would cast a full block in each iteration.
-    walk = _trace_remaining(scene, walk, settings, block, capacities, least=block // 4)
+    walk = _trace_remaining(scene, walk, kind.settings, block, capacities, least=block // 4)
     stack = queues.append(
         walk.stack, walk.next.items, jnp.arange(block, dtype=jnp.int32) < walk.next.count
     )
     small = block // _SMALLER
     walk = _Walk(*queues.pop(stack, small), walk.tree)
-    return _trace_remaining(scene, walk, settings, small, capacities, least=1).tree
+    return _trace_remaining(scene, walk, kind.settings, small, capacities, least=1).tree
 
 
 def _in_cached_blocks(
@@ -263,10 +293,9 @@ def _in_cached_blocks(
     rays: Rays,
     interior_list: Int[Array, "rays slots"],
     *,
-    settings: PathSettings,
-    footprint: Footprint,
+    kind: _Kind,
 ) -> PathTree:
-    return _in_blocks(scene, rays, interior_list, settings, footprint, _BLOCK_ON_CPU)
+    return _in_blocks(scene, rays, interior_list, kind, _BLOCK_ON_CPU)
 
 
 def _at_once(
@@ -274,12 +303,11 @@ def _at_once(
     rays: Rays,
     interior_list: Int[Array, "rays slots"],
     *,
-    settings: PathSettings,
-    footprint: Footprint,
+    kind: _Kind,
 ) -> PathTree:
     """Traces all rays as one block, with lists as long as those of `_in_cached_blocks`."""
-    tree = _in_blocks(scene, rays, interior_list, settings, footprint, _BLOCK)
-    like = _empty(scene, rays, interior_list, settings=settings, footprint=footprint)
+    tree = _in_blocks(scene, rays, interior_list, kind, _BLOCK)
+    like = _empty(scene, rays, interior_list, kind=kind)
     return jax.tree.map(lambda x, y: x[: y.shape[0]] if y.ndim else x, tree, like)
 
 
@@ -288,14 +316,13 @@ def _empty(
     rays: Rays,
     interior_list: Int[Array, "rays slots"],
     *,
-    settings: PathSettings,
-    footprint: Footprint,
+    kind: _Kind,
 ) -> PathTree:
     """Returns the path tree of `_in_cached_blocks` before any ray is cast."""
     count = rays.radii.shape[0]
     block = max(1, min(_BLOCK_ON_CPU, count))
-    capacities = path_settings.capacities(settings, count)
-    return _begin(scene, rays, interior_list, footprint, block, capacities).tree
+    capacities = path_settings.capacities(kind.settings, count)
+    return _begin(scene, rays, interior_list, kind, block, capacities).tree
 
 
 _as_platform_likes = chosen_by_platform(
@@ -338,10 +365,11 @@ def _refuse_gradients(
     settings: PathSettings,
     footprint: Footprint,
     block: int | None,
+    stored: bool,
     primals: object,
     tangents: object,
 ) -> NoReturn:
-    del settings, footprint, block, primals, tangents
+    del settings, footprint, block, stored, primals, tangents
     raise TypeError(
         "Light paths of trace have no derivatives with respect to rays or the scene. Use "
         "follow_branch or follow_main_branches, or hold rays and the scene constant with "
@@ -363,25 +391,27 @@ def _begin(
     scene: Scene,
     rays: Rays,
     interior_list: Int[Array, "rays slots"],
-    footprint: Footprint,
+    kind: _Kind,
     block: int,
     capacities: Capacities,
 ) -> _Walk:
     """Pushes the camera rays on the stack and stores their segments."""
     count = rays.radii.shape[0]
     order = jnp.arange(count, dtype=jnp.int32)
-    differential = jax.vmap(lambda ray: ray_differentials.begin(ray, footprint))(rays)
+    differential = jax.vmap(lambda ray: ray_differentials.begin(ray, kind.footprint))(rays)
     state = jax.vmap(path_step.begin)(rays, interior_list, differential)
     if media.has_dispersion(scene.interfaces):  # three rays follow each other, one per channel
         channels = jnp.eye(3, dtype=state.throughput.dtype)
         state = state._replace(throughput=channels[order % 3])
     ambient = jnp.full_like(order, media.AMBIENT)
-    first = jnp.full_like(order, NO_SEGMENT)
-    nowhere = jnp.full_like(order, media.EMPTY_SLOT)
-    segments = Segments(
-        first, state.point, state.direction, state.tau, ambient, nowhere, state.differential
-    )
-    ends = Ends(order, order, state.throughput, order, order, _no_stop(scene, state))
+    live = Live(state, order, order, None if kind.stored else ambient)
+    segments = last = None
+    if kind.stored:
+        first, nowhere = jnp.full_like(order, NO_SEGMENT), jnp.full_like(order, media.EMPTY_SLOT)
+        segments = _segments(live._replace(segments=first), ambient, nowhere)
+    else:
+        last = _segments(live, ambient)
+    ends = Ends(order, order, state.throughput, order, order, _no_stop(scene, state), last)
     # Each buffer has slots beyond its capacity for the records that one iteration may append.
     tree = PathTree(
         segments=queues.fill(segments, count, capacities.segments + 2 * block),
@@ -389,7 +419,7 @@ def _begin(
         dropped=jnp.zeros_like(rays.origins),
         casts=jnp.zeros((), jnp.int32),
     )
-    stack = queues.fill(Live(state, order, order), count, capacities.live + 2 * block)
+    stack = queues.fill(live, count, capacities.live + 2 * block)
     return _Walk(*queues.pop(stack, block), tree)
 
 
@@ -407,7 +437,11 @@ def _trace_block(
     tree = walk.tree._replace(casts=walk.tree.casts + jnp.sum(alive, dtype=jnp.int32))
     medium = arrival.interaction.sides.medium_near
     # The medium of a camera is known only from the first surface it sees.
-    tree = path_tree.set_media(tree, live.segments, medium, hit & (live.state.num_bends == 0))
+    seen = hit & (live.state.num_bends == 0)
+    if live.media is None:
+        tree = path_tree.set_media(tree, live.segments, medium, seen)
+    else:
+        live = live._replace(media=jnp.where(seen, medium, live.media))
     ended, stop = jax.vmap(path_step.stop)(live.state, arrival, status)
     tree = end_by(settings, tree, live._replace(state=ended), status, alive & ~bending, stop)
     branches = jax.vmap(functools.partial(path_step.branch, settings))(
