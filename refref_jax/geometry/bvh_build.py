@@ -123,11 +123,13 @@ class _Space(NamedTuple):
     @classmethod
     def of(cls, shape: tuple[int, int], kind: np.dtype) -> "_Space":
         """Returns memory for a grid of some rows and columns."""
-        reach = (np.empty((6, *shape), kind) for _ in range(2))
-        return cls(*reach, np.empty((3, *shape)), np.empty((2, *shape)))
+        before, after = np.empty((2, 6, *shape), kind)
+        return cls(before, after, np.empty((3, *shape)), np.empty((2, *shape)))
 
 
-def _areas(space: _Space, owner: Int[np.ndarray, " columns"]) -> Float[np.ndarray, "2 rows columns"]:
+def _areas(
+    space: _Space, owner: Int[np.ndarray, " columns"]
+) -> Float[np.ndarray, "2 rows columns"]:
     """Returns half the areas of two boxes per face, in double precision.
 
     The first is around its node's faces up to it, and the second around those after it.

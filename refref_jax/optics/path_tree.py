@@ -11,7 +11,7 @@ depends on the number of slots.
 Symbols as in `light_paths`.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -35,8 +35,7 @@ class Segments(NamedTuple):
     """A list of path segments; the first ones are the camera rays.
 
     Attributes:
-      parents: index of the parent segment, `NO_SEGMENT` for a camera ray; `None`, like `parts`, in
-        a list of last segments.
+      parents: index of the parent segment, `NO_SEGMENT` for a camera ray.
       points: start of the segment, world units.
       directions: unit direction.
       tau: arc length from the camera to the start.
@@ -45,12 +44,22 @@ class Segments(NamedTuple):
       differentials: ray differential of the segment (see `ray_differentials`).
     """
 
-    parents: Int[Array, " segments"] | None
+    parents: Int[Array, " segments"]
     points: Float[Array, "segments 3"]
     directions: Float[Array, "segments 3"]
     tau: Float[Array, " segments"]
     media: Int[Array, " segments"]
-    parts: Int[Array, " segments"] | None
+    parts: Int[Array, " segments"]
+    differentials: RayDifferential
+
+
+class LastSegments(NamedTuple):
+    """The last segments of paths, where no others are stored; fields as in `Segments`."""
+
+    points: Float[Array, "paths 3"]
+    directions: Float[Array, "paths 3"]
+    tau: Float[Array, " paths"]
+    media: Int[Array, " paths"]
     differentials: RayDifferential
 
 
@@ -58,7 +67,7 @@ class Ends(NamedTuple):
     """The ends of paths.
 
     Attributes:
-      segments: index of the last segment; meaningless if segments are not stored.
+      segments: index of the last segment; `None` if segments are not stored.
       rays: index of the camera ray.
       throughput: share of the ray's linear RGB that the path carries.
       num_bends: number of bends.
@@ -67,13 +76,13 @@ class Ends(NamedTuple):
       last: last segments, if segments are not stored.
     """
 
-    segments: Int[Array, " paths"]
+    segments: Int[Array, " paths"] | None
     rays: Int[Array, " paths"]
     throughput: Float[Array, "paths 3"]
     num_bends: Int[Array, " paths"]
     statuses: Int[Array, " paths"]
     stop: Stop | None = None
-    last: Segments | None = None
+    last: LastSegments | None = None
 
 
 class PathTree(NamedTuple):
@@ -115,7 +124,7 @@ def listed(tree: PathTree, capacity: int) -> Ends:
 def emptied(ends: Ends, empty: Bool[Array, " paths"], home: Int[Array, " paths"]) -> Ends:
     """Clears the marked slots, which then refer to the camera ray `home`."""
     return Ends(
-        segments=jnp.where(empty, home, ends.segments),
+        segments=None if ends.segments is None else jnp.where(empty, home, ends.segments),
         rays=jnp.where(empty, home, ends.rays),
         throughput=jnp.where(empty[:, None], 0.0, ends.throughput),
         num_bends=jnp.where(empty, 0, ends.num_bends),
@@ -125,7 +134,7 @@ def emptied(ends: Ends, empty: Bool[Array, " paths"], home: Int[Array, " paths"]
     )
 
 
-def _first_where(empty: Bool[Array, " paths"], last: Segments) -> Segments:
+def _first_where(empty: Bool[Array, " paths"], last: LastSegments) -> LastSegments:
     """Returns last segments with that of the first path in empty slots: finite, if meaningless."""
 
     def choose(x: Array) -> Array:
@@ -226,7 +235,8 @@ class _Walk(NamedTuple):
 
 
 def _walk_back(segments: Segments, ends: Ends, detail: Detail, tallied: int) -> _Walk:
-    count = ends.segments.shape[0]
+    last = cast(Array, ends.segments)
+    count = last.shape[0]
     none = jnp.zeros_like(segments.tau, shape=(count, tallied))
     lanes = jnp.arange(detail.most, dtype=jnp.int32)[None]
     names = jnp.arange(tallied, dtype=jnp.int32)[None]
@@ -252,9 +262,9 @@ def _walk_back(segments: Segments, ends: Ends, detail: Detail, tallied: int) -> 
         )
 
     start = _Walk(
-        segment=ends.segments,
+        segment=last,
         stop=jnp.full_like(none, jnp.inf, shape=(count,)),
-        found=jnp.zeros_like(ends.segments),
+        found=jnp.zeros_like(last),
         picked=jnp.zeros((count, detail.most), jnp.int32),
         stops=jnp.full_like(none, jnp.inf, shape=(count, detail.most)),
         hit_counts=none,

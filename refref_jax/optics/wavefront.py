@@ -18,7 +18,7 @@ with surfaces.
 """
 
 import functools
-from typing import NamedTuple, NoReturn
+from typing import NamedTuple, NoReturn, cast
 
 import jax
 import jax.numpy as jnp
@@ -32,7 +32,7 @@ from refref_jax.optics import media, path_settings, path_step, path_tree, queues
 from refref_jax.optics.light_paths import PathStatus, Stop
 from refref_jax.optics.path_settings import Capacities, PathSettings
 from refref_jax.optics.path_step import Arrival, Branches, RayState
-from refref_jax.optics.path_tree import NO_SEGMENT, Ends, PathTree, Segments
+from refref_jax.optics.path_tree import NO_SEGMENT, Ends, LastSegments, PathTree, Segments
 from refref_jax.optics.queues import Queue
 from refref_jax.optics.scene import Scene
 
@@ -53,13 +53,13 @@ class Live(NamedTuple):
     Attributes:
       state: states of the rays.
       rays: index of each one's camera ray.
-      segments: index of each one's current segment.
+      segments: index of each one's current segment; `None` if segments are not stored.
       media: medium of the current segment; `None` if segments are stored.
     """
 
     state: RayState
     rays: Int[Array, " live"]
-    segments: Int[Array, " live"]
+    segments: Int[Array, " live"] | None
     media: Int[Array, " live"] | None = None
 
     @property
@@ -125,29 +125,34 @@ def store_segments(
     live = children.live
     left = capacities.segments - tree.segments.count
     kept = queues.strongest(children.exists, jnp.max(live.throughput, axis=-1), left)
-    index = tree.segments.count + jnp.cumsum(kept, dtype=jnp.int32) - 1
-    state, log = live.state, tree.segments
-    logged = None if log.items is None else _segments(live, children.media, children.parts)
+    log, logged = tree.segments, None
+    if log.items is not None:
+        logged = _segments(live.state, live.segments, children.media, children.parts)
+        index = log.count + jnp.cumsum(kept, dtype=jnp.int32) - 1
+        children = children._replace(live=live._replace(segments=index))
     log = queues.append(log, logged, kept)
     dropped = queues.add_dropped(tree.dropped, live.rays, live.throughput, children.exists & ~kept)
-    children = children._replace(live=live._replace(segments=index), exists=kept)
-    return tree._replace(segments=log, dropped=dropped), children
+    return tree._replace(segments=log, dropped=dropped), children._replace(exists=kept)
 
 
 def _segments(
-    live: Live, medium: Int[Array, " n"], parts: Int[Array, " n"] | None = None
+    state: RayState,
+    parents: Int[Array, " n"] | None,
+    media: Int[Array, " n"],
+    parts: Int[Array, " n"],
 ) -> Segments:
-    """Returns the current segments of rays; without parts and parents, if they are not stored."""
+    """Returns the current segments of rays."""
+    parents = cast(Array, parents)
+    line = state.point, state.direction, state.tau
+    return Segments(parents, *line, media, parts, state.differential)
+
+
+def _last_segments(live: Live) -> LastSegments | None:
+    """Returns the current segments of rays, if no others are stored."""
+    if live.media is None:
+        return None
     state = live.state
-    return Segments(
-        None if parts is None else live.segments,
-        state.point,
-        state.direction,
-        state.tau,
-        medium,
-        parts,
-        state.differential,
-    )
+    return LastSegments(state.point, state.direction, state.tau, live.media, state.differential)
 
 
 def push_or_end(
@@ -195,10 +200,8 @@ def end(
     if like is not None and stop is None:
         tau = jnp.full_like(live.state.tau, jnp.inf)
         stop = Stop(tau, None if like.radiance is None else jnp.zeros_like(live.throughput))
-    last = None if live.media is None else _segments(live, live.media)
-    block = Ends(
-        live.segments, live.rays, live.throughput, live.state.num_bends, status, stop, last
-    )
+    state, last = live.state, _last_segments(live)
+    block = Ends(live.segments, live.rays, live.throughput, state.num_bends, status, stop, last)
     return tree._replace(ends=queues.append(tree.ends, block, ending))
 
 
@@ -274,7 +277,7 @@ def _in_blocks(
 ) -> PathTree:
     count = rays.radii.shape[0]
     block = max(1, min(block, count))
-    capacities = path_settings.capacities(kind.settings, count)
+    capacities = _capacities(kind.settings, count, block)
     walk = _begin(scene, rays, interior_list, kind, block, capacities)
     if count < _MANY_BLOCKS * block or block < _SMALLER:
         return _trace_remaining(scene, walk, kind.settings, block, capacities, least=1).tree
@@ -286,6 +289,18 @@ def _in_blocks(
     small = block // _SMALLER
     walk = _Walk(*queues.pop(stack, small), walk.tree)
     return _trace_remaining(scene, walk, kind.settings, small, capacities, least=1).tree
+
+
+def _capacities(settings: PathSettings, count: int, block: int) -> Capacities:
+    """Returns the capacities for some rays, without what their stack cannot fill.
+
+    Each iteration pushes at most `2 * block` children. While some of them are on the stack, all
+    that are pushed above them have more bends than the ones with the fewest bends among them. So
+    there are never more such groups than bends, above the camera rays.
+    """
+    capacities = path_settings.capacities(settings, count)
+    most = count + 2 * block * settings.max_bends
+    return capacities._replace(live=min(capacities.live, most))
 
 
 def _in_cached_blocks(
@@ -321,7 +336,7 @@ def _empty(
     """Returns the path tree of `_in_cached_blocks` before any ray is cast."""
     count = rays.radii.shape[0]
     block = max(1, min(_BLOCK_ON_CPU, count))
-    capacities = path_settings.capacities(kind.settings, count)
+    capacities = _capacities(kind.settings, count, block)
     return _begin(scene, rays, interior_list, kind, block, capacities).tree
 
 
@@ -404,14 +419,12 @@ def _begin(
         channels = jnp.eye(3, dtype=state.throughput.dtype)
         state = state._replace(throughput=channels[order % 3])
     ambient = jnp.full_like(order, media.AMBIENT)
-    live = Live(state, order, order, None if kind.stored else ambient)
-    segments = last = None
+    live, segments = Live(state, order, None, ambient), None
     if kind.stored:
         first, nowhere = jnp.full_like(order, NO_SEGMENT), jnp.full_like(order, media.EMPTY_SLOT)
-        segments = _segments(live._replace(segments=first), ambient, nowhere)
-    else:
-        last = _segments(live, ambient)
-    ends = Ends(order, order, state.throughput, order, order, _no_stop(scene, state), last)
+        live, segments = Live(state, order, order), _segments(state, first, ambient, nowhere)
+    stop, last = _no_stop(scene, state), _last_segments(live)
+    ends = Ends(live.segments, order, state.throughput, order, order, stop, last)
     # Each buffer has slots beyond its capacity for the records that one iteration may append.
     tree = PathTree(
         segments=queues.fill(segments, count, capacities.segments + 2 * block),
