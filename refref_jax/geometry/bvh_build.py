@@ -23,88 +23,153 @@ from refref_jax.numerics import host_array
 # Sign bit of each axis in the number of an octant, as in `bvh_nodes.octant`.
 _BACKWARDS = ((np.arange(bvh_nodes.OCTANTS)[:, None] >> np.arange(3)) & 1).astype(bool)
 
+# Relative difference of costs that count as equal: rounding must not choose between them.
+_TIE = 1e-9
+
+
+class _Grid(NamedTuple):
+    """Places of a level's faces, in columns of equal length; a node fills as many as it needs.
+
+    Running bounds are then computed for all columns at once. What a node does not fill repeats its
+    last face.
+
+    Attributes:
+      places: place of each face in the orders.
+      taken: number of the node's faces up to and including this one, more than it has in the rest.
+      owner: node of each column.
+      first: first column of each node.
+    """
+
+    places: Int[np.ndarray, "rows columns"]
+    taken: Int[np.ndarray, "rows columns"]
+    owner: Int[np.ndarray, " columns"]
+    first: Int[np.ndarray, " nodes"]
+
+
+def _grid(counts: Int[np.ndarray, " nodes"]) -> _Grid:
+    """Returns columns of 8 to 64 places for nodes of some numbers of faces."""
+    rows = int(np.clip(1 << int(np.mean(counts) / 2).bit_length(), 8, 64))
+    columns = -(-counts // rows)
+    owner = np.repeat(np.arange(counts.size, dtype=np.int32), columns)
+    first = np.cumsum(columns, dtype=np.int32) - columns
+    above = rows * (np.arange(owner.size, dtype=np.int32) - first[owner])
+    taken = np.arange(1, rows + 1, dtype=np.int32)[:, None] + above
+    start = np.cumsum(counts, dtype=np.int32) - counts
+    return _Grid(np.minimum(taken, counts[owner]) + (start[owner] - 1), taken, owner, first)
+
 
 def best_splits(
     orders: list[Int[np.ndarray, " faces"]],
     counts: Int[np.ndarray, " nodes"],
-    lower: Float[np.ndarray, "all 3"],
-    upper: Float[np.ndarray, "all 3"],
-    scene: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]],
+    reach: Float[np.ndarray, "6 all"],
 ) -> tuple[Int[np.ndarray, " nodes"], Int[np.ndarray, " nodes"]]:
     """Finds the cheapest split of each node.
 
     Args:
       orders: faces sorted by centroid along each axis, node after node.
       counts: number of faces of each node, at least two.
-      lower: lower corner of every face's box.
-      upper: upper corner of every face's box.
-      scene: lower and upper corner of the box around all faces, in double precision.
+      reach: upper corner of every face's box, then its lower corner with the sign changed.
 
     Returns:
       The number of faces that go left, and the split axis. Of equally cheap splits along an axis,
-      the one nearest to the middle is taken.
+      the one nearest to the middle is taken; of equally cheap axes, the first.
     """
-    first = np.cumsum(counts) - counts
-    owner = np.repeat(np.arange(counts.size), counts)
-    taken = np.arange(owner.size) - first[owner] + 1
-    remaining = counts[owner] - taken
-    leaves_left, leaves_right = -(-taken // LEAF_SIZE), -(-remaining // LEAF_SIZE)
+    grid = _grid(counts)
+    of_node = counts[grid.owner]
+    remaining = of_node - grid.taken
+    leaves_left = (-(-grid.taken // LEAF_SIZE)).astype(np.float64)
+    leaves_right = (-(-remaining // LEAF_SIZE)).astype(np.float64)
+    is_last = remaining <= 0
     cheapest = np.full(counts.size, np.inf)
-    left, axis = np.zeros_like(counts), np.zeros_like(counts)
+    axis = np.zeros_like(counts)
+    best = np.full(grid.places.shape, np.inf)
+    space = _Space.of(grid.places.shape, reach.dtype)
     for direction, order in enumerate(orders):
-        area_left, area_right = _areas(lower[order], upper[order], owner, scene)
-        cost = area_left * leaves_left
-        cost[:-1] += area_right[1:] * leaves_right[:-1]
-        cost[remaining == 0] = np.inf
-        lowest = np.minimum.reduceat(cost, first)
-        tied = np.flatnonzero(cost <= lowest[owner] * (1 + 1e-9))
-        off_middle = np.abs(taken[tied] - remaining[tied])
-        nearest = tied[np.lexsort((off_middle, owner[tied]))]
-        _, index = np.unique(owner[nearest], return_index=True)
-        better = lowest < cheapest
+        np.take(reach, order[grid.places], axis=1, out=space.before, mode="clip")
+        left, right = _areas(space, grid.owner)
+        left *= leaves_left
+        right *= leaves_right
+        cost = np.add(left, right, out=left)
+        cost[is_last] = np.inf
+        lowest = np.minimum.reduceat(cost.min(axis=0), grid.first)
+        better = lowest < cheapest * (1 - _TIE)
         cheapest = np.where(better, lowest, cheapest)
-        left = np.where(better, taken[nearest[index]], left)
         axis = np.where(better, direction, axis)
-    return left, axis
+        np.copyto(best, cost, where=better[grid.owner])
+    off_middle = grid.taken - remaining
+    rank = 2 * np.abs(off_middle) + (off_middle > 0)
+    tied = best <= (cheapest * (1 + _TIE))[grid.owner]
+    nearest = np.where(tied, rank, np.iinfo(rank.dtype).max).min(axis=0)
+    nearest = np.minimum.reduceat(nearest, grid.first)
+    off_middle = np.where(nearest & 1, nearest >> 1, -(nearest >> 1))
+    return (counts + off_middle) >> 1, axis
+
+
+class _Space(NamedTuple):
+    """Memory for the bounds of a level, since fresh pages would cost half of its time.
+
+    Attributes:
+      before: `reach` of the faces at the grid's places, then of all up to each.
+      after: `reach` of all faces after each.
+      sizes: extents of the boxes along the axes.
+      areas: half the areas of the boxes, of `before` and of `after`.
+    """
+
+    before: Float[np.ndarray, "6 rows columns"]
+    after: Float[np.ndarray, "6 rows columns"]
+    sizes: Float[np.ndarray, "3 rows columns"]
+    areas: Float[np.ndarray, "2 rows columns"]
+
+    @classmethod
+    def of(cls, shape: tuple[int, int], kind: np.dtype) -> "_Space":
+        """Returns memory for a grid of some rows and columns."""
+        before, after = np.empty((2, 6, *shape), kind)
+        return cls(before, after, np.empty((3, *shape)), np.empty((2, *shape)))
 
 
 def _areas(
-    lower: Float[np.ndarray, "faces 3"],
-    upper: Float[np.ndarray, "faces 3"],
-    owner: Int[np.ndarray, " faces"],
-    scene: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]],
-) -> tuple[Float[np.ndarray, " faces"], Float[np.ndarray, " faces"]]:
-    """Returns half the areas of two boxes per face: around its node's faces up to it, and from it.
+    space: _Space, owner: Int[np.ndarray, " columns"]
+) -> Float[np.ndarray, "2 rows columns"]:
+    """Returns half the areas of two boxes per face, in double precision.
 
-    Both include the face itself.
+    The first is around its node's faces up to it, and the second around those after it.
     """
-    before, after = [], []
-    for axis in range(3):
-        base, top = scene[0][axis], scene[1][axis]
-        span = top - base
-        high, low = upper[:, axis] - base, top - lower[:, axis]
-        before.append(_running(high, owner, span) + _running(low, owner, span) - span)
-        back = owner[-1] - owner[::-1]
-        from_end = _running(high[::-1], back, span) + _running(low[::-1], back, span) - span
-        after.append(from_end[::-1])
-    return _half_area(*before), _half_area(*after)
+    before, after, sizes, areas = space
+    most, rows = before.max(axis=1), before.shape[1]
+    after[:, -1] = _most_before(most[:, ::-1], owner[::-1], before[:, -1, ::-1])[:, ::-1]
+    for row in range(rows - 2, -1, -1):
+        np.maximum(before[:, row + 1], after[:, row + 1], out=after[:, row])
+    before[:, 0] = np.maximum(before[:, 0], _most_before(most, owner, before[:, 0]))
+    for row in range(1, rows):
+        np.maximum(before[:, row - 1], before[:, row], out=before[:, row])
+    for reach, area in zip((before, after), areas, strict=True):
+        x, y, z = np.add(reach[:3], reach[3:], out=sizes, dtype=np.float64)
+        np.add(y, z, out=area)
+        area *= x
+        y *= z
+        area += y
+    return areas
 
 
-def _running(
-    values: Float[np.ndarray, " faces"], owner: Int[np.ndarray, " faces"], span: float
-) -> Float[np.ndarray, " faces"]:
-    """Returns the running maximum within each owner's range; values are in `[0, span]`.
+def _most_before(
+    most: Float[np.ndarray, "6 columns"],
+    owner: Int[np.ndarray, " columns"],
+    otherwise: Float[np.ndarray, "6 columns"],
+) -> Float[np.ndarray, "6 columns"]:
+    """Returns the maximum over all previous columns of the same node, or a value if there are none.
 
-    Each owner's values are offset above those of the previous owner, so that one accumulation
-    serves all. In double precision this costs `owners * span` units in the last place, which is
-    negligible.
+    The distance over which maxima are combined doubles until it exceeds the largest node.
     """
-    storey = owner * (2.0 * span)
-    return np.maximum.accumulate(values + storey) - storey
-
-
-def _half_area(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
-    return x * y + y * z + z * x
+    found = np.where(np.append(False, owner[1:] == owner[:-1]), np.roll(most, 1, axis=1), otherwise)
+    distance = 1
+    while distance < owner.size:
+        same = owner[distance:] == owner[:-distance]
+        if not same.any():
+            break
+        earlier = np.where(same, found[:, :-distance], found[:, distance:])
+        found[:, distance:] = np.maximum(found[:, distance:], earlier)
+        distance *= 2
+    return found
 
 
 class Level(NamedTuple):
@@ -309,31 +374,33 @@ def _empty(dtype: np.dtype) -> BVH:
 
 
 def _split_all(
-    lower: Float[np.ndarray, "faces 3"], upper: Float[np.ndarray, "faces 3"]
+    lower: Float[np.ndarray, "faces 3"],
+    upper: Float[np.ndarray, "faces 3"],
 ) -> tuple[list[Level], Int[np.ndarray, " faces"]]:
     """Splits until every node fits in a leaf; returns the levels and the faces in leaf order."""
     centroids = 0.5 * lower + 0.5 * upper
-    scene = lower.min(axis=0).astype(np.float64), upper.max(axis=0).astype(np.float64)
-    orders = [np.argsort(centroids[:, axis], kind="stable") for axis in range(3)]
-    final = np.empty(len(lower), np.int64)
-    level = Level(np.array([0]), np.array([len(lower)]), np.array([-1]))
+    reach = np.ascontiguousarray(np.concatenate([upper, -lower], axis=1).T)
+    orders = [np.argsort(along, kind="stable").astype(np.int32) for along in centroids.T]
+    final = np.empty(len(lower), np.int32)
+    level = Level(*np.array([[0], [len(lower)], [-1]], np.int32))
     levels = [level]
     while True:
         counts = level.end - level.start
-        positions = runs(level.start, counts)
-        small = np.repeat(counts <= LEAF_SIZE, counts)
-        final[positions[small]] = orders[0][small]
-        split = np.flatnonzero(counts > LEAF_SIZE)
-        if split.size == 0:
+        large = counts > LEAF_SIZE
+        if not large.all():
+            kept = np.repeat(large, counts)
+            final[runs(level.start[~large], counts[~large])] = orders[0][~kept]
+            orders = [order[kept] for order in orders]
+        if not large.any():
             return levels, final
-        orders = [order[~small] for order in orders]
-        left, axis = best_splits(orders, counts[split], lower, upper, scene)
+        split = np.flatnonzero(large)
+        left, axis = best_splits(orders, counts[split], reach)
         orders = _partition(orders, counts[split], left, axis)
         level.child[split] = 2 * np.arange(split.size)
         middle = level.start[split] + left
         start = np.stack([level.start[split], middle], axis=1).ravel()
         end = np.stack([middle, level.end[split]], axis=1).ravel()
-        level = Level(start, end, np.full(start.size, -1))
+        level = Level(start, end, np.full_like(start, -1))
         levels.append(level)
 
 
@@ -351,21 +418,15 @@ def _partition(
       left: number of faces that go left.
       axis: split axis of each node; the first `left` faces in its order go left.
     """
-    first = np.cumsum(counts) - counts
-    owner = np.repeat(np.arange(counts.size), counts)
-    right_in_order = np.arange(owner.size) - first[owner] >= left[owner]
+    sides = np.tile(np.array([False, True]), counts.size)
+    is_right = np.repeat(sides, np.stack([left, counts - left], axis=1).ravel())
     goes_right = np.zeros(max(order.max() for order in orders) + 1, bool)
-    for direction, order in enumerate(orders):
-        chosen = axis[owner] == direction
-        goes_right[order[chosen]] = right_in_order[chosen]
+    goes_right[np.choose(np.repeat(axis, counts), orders)] = is_right
+    lefts, rights = np.flatnonzero(~is_right), np.flatnonzero(is_right)
     moved = []
     for order in orders:
         right = goes_right[order]
-        rank = np.cumsum(~right)
-        rank_left = rank - (rank[first] - ~right[first])[owner] - 1
-        rank_right = np.arange(owner.size) - first[owner] - rank_left - 1
-        place = first[owner] + np.where(right, left[owner] + rank_right, rank_left)
         new = np.empty_like(order)
-        new[place] = order
+        new[lefts], new[rights] = order[~right], order[right]
         moved.append(new)
     return moved

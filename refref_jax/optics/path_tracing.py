@@ -110,7 +110,15 @@ def trace_ends(
         rays, interior_list = jax.tree.map(
             lambda x: jnp.repeat(x, times, axis=0), (rays, interior_list)
         )
-    tree = follow(scene, rays, interior_list, settings=settings, footprint=footprint, block=block)
+    tree = follow(
+        scene,
+        rays,
+        interior_list,
+        settings=settings,
+        footprint=footprint,
+        block=block,
+        stored=False,
+    )
     ends = path_tree.listed(tree, capacities(settings, rays.radii.shape[0]).paths)
     last = path_tree.last_segments(tree.segments.items, ends)
     traced = TracedEnds(last, tree.dropped, tree.casts)

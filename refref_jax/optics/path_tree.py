@@ -11,7 +11,7 @@ depends on the number of slots.
 Symbols as in `light_paths`.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -53,31 +53,43 @@ class Segments(NamedTuple):
     differentials: RayDifferential
 
 
+class LastSegments(NamedTuple):
+    """The last segments of paths, where no others are stored; fields as in `Segments`."""
+
+    points: Float[Array, "paths 3"]
+    directions: Float[Array, "paths 3"]
+    tau: Float[Array, " paths"]
+    media: Int[Array, " paths"]
+    differentials: RayDifferential
+
+
 class Ends(NamedTuple):
     """The ends of paths.
 
     Attributes:
-      segments: index of the last segment.
+      segments: index of the last segment; `None` if segments are not stored.
       rays: index of the camera ray.
       throughput: share of the ray's linear RGB that the path carries.
       num_bends: number of bends.
       statuses: `PathStatus` of each path.
       stop: ends on opaque surfaces, `None` without such surfaces.
+      last: last segments, if segments are not stored.
     """
 
-    segments: Int[Array, " paths"]
+    segments: Int[Array, " paths"] | None
     rays: Int[Array, " paths"]
     throughput: Float[Array, "paths 3"]
     num_bends: Int[Array, " paths"]
     statuses: Int[Array, " paths"]
     stop: Stop | None = None
+    last: LastSegments | None = None
 
 
 class PathTree(NamedTuple):
     """All paths of the rays that are traced together.
 
     Attributes:
-      segments: list of `Segments`.
+      segments: list of `Segments`; only their number, if they are not stored.
       ends: list of `Ends`, one per path.
       dropped: dropped throughput of each ray, linear RGB.
       casts: number of rays that were cast.
@@ -112,18 +124,28 @@ def listed(tree: PathTree, capacity: int) -> Ends:
 def emptied(ends: Ends, empty: Bool[Array, " paths"], home: Int[Array, " paths"]) -> Ends:
     """Clears the marked slots, which then refer to the camera ray `home`."""
     return Ends(
-        segments=jnp.where(empty, home, ends.segments),
+        segments=None if ends.segments is None else jnp.where(empty, home, ends.segments),
         rays=jnp.where(empty, home, ends.rays),
         throughput=jnp.where(empty[:, None], 0.0, ends.throughput),
         num_bends=jnp.where(empty, 0, ends.num_bends),
         statuses=jnp.where(empty, PathStatus.EMPTY, ends.statuses).astype(jnp.int32),
         stop=ends.stop and ends.stop._replace(tau=jnp.where(empty, jnp.inf, ends.stop.tau)),
+        last=ends.last and _first_where(empty, ends.last),
     )
 
 
-def last_segments(segments: Segments, ends: Ends) -> PathEnds:
+def _first_where(empty: Bool[Array, " paths"], last: LastSegments) -> LastSegments:
+    """Returns last segments with that of the first path in empty slots: finite, if meaningless."""
+
+    def choose(x: Array) -> Array:
+        return jnp.where(empty.reshape(-1, *[1] * (x.ndim - 1)), x[:1], x)
+
+    return jax.tree.map(choose, last)
+
+
+def last_segments(segments: Segments | None, ends: Ends) -> PathEnds:
     """Returns the last segment of each path."""
-    last = jax.tree.map(lambda x: x[ends.segments], segments)
+    last = ends.last or jax.tree.map(lambda x: x[ends.segments], segments)
     return PathEnds(
         origins=last.points,
         directions=last.directions,
@@ -213,7 +235,8 @@ class _Walk(NamedTuple):
 
 
 def _walk_back(segments: Segments, ends: Ends, detail: Detail, tallied: int) -> _Walk:
-    count = ends.segments.shape[0]
+    last = cast(Array, ends.segments)
+    count = last.shape[0]
     none = jnp.zeros_like(segments.tau, shape=(count, tallied))
     lanes = jnp.arange(detail.most, dtype=jnp.int32)[None]
     names = jnp.arange(tallied, dtype=jnp.int32)[None]
@@ -239,9 +262,9 @@ def _walk_back(segments: Segments, ends: Ends, detail: Detail, tallied: int) -> 
         )
 
     start = _Walk(
-        segment=ends.segments,
+        segment=last,
         stop=jnp.full_like(none, jnp.inf, shape=(count,)),
-        found=jnp.zeros_like(ends.segments),
+        found=jnp.zeros_like(last),
         picked=jnp.zeros((count, detail.most), jnp.int32),
         stops=jnp.full_like(none, jnp.inf, shape=(count, detail.most)),
         hit_counts=none,

@@ -18,7 +18,7 @@ with surfaces.
 """
 
 import functools
-from typing import NamedTuple, NoReturn
+from typing import NamedTuple, NoReturn, cast
 
 import jax
 import jax.numpy as jnp
@@ -32,7 +32,7 @@ from refref_jax.optics import media, path_settings, path_step, path_tree, queues
 from refref_jax.optics.light_paths import PathStatus, Stop
 from refref_jax.optics.path_settings import Capacities, PathSettings
 from refref_jax.optics.path_step import Arrival, Branches, RayState
-from refref_jax.optics.path_tree import NO_SEGMENT, Ends, PathTree, Segments
+from refref_jax.optics.path_tree import NO_SEGMENT, Ends, LastSegments, PathTree, Segments
 from refref_jax.optics.queues import Queue
 from refref_jax.optics.scene import Scene
 
@@ -53,12 +53,14 @@ class Live(NamedTuple):
     Attributes:
       state: states of the rays.
       rays: index of each one's camera ray.
-      segments: index of each one's current segment.
+      segments: index of each one's current segment; `None` if segments are not stored.
+      media: medium of the current segment; `None` if segments are stored.
     """
 
     state: RayState
     rays: Int[Array, " live"]
-    segments: Int[Array, " live"]
+    segments: Int[Array, " live"] | None
+    media: Int[Array, " live"] | None = None
 
     @property
     def throughput(self) -> Float[Array, "live 3"]:
@@ -101,7 +103,10 @@ def children_of(
         traced &= mediums != media.AMBIENT
     return Children(
         live=Live(
-            states, queues.join(live.rays, live.rays), queues.join(live.segments, live.segments)
+            states,
+            queues.join(live.rays, live.rays),
+            queues.join(live.segments, live.segments),
+            None if live.media is None else mediums,
         ),
         media=mediums,
         parts=queues.join(sides.part, sides.part),
@@ -113,25 +118,41 @@ def children_of(
 def store_segments(
     tree: PathTree, children: Children, capacities: Capacities
 ) -> tuple[PathTree, Children]:
-    """Stores the segments of children; drops the weakest children if the buffer is full."""
+    """Stores the segments of children; drops the weakest children if the buffer is full.
+
+    Without stored segments only their number counts, with the same limit.
+    """
     live = children.live
     left = capacities.segments - tree.segments.count
     kept = queues.strongest(children.exists, jnp.max(live.throughput, axis=-1), left)
-    index = tree.segments.count + jnp.cumsum(kept, dtype=jnp.int32) - 1
-    state = live.state
-    logged = Segments(
-        live.segments,
-        state.point,
-        state.direction,
-        state.tau,
-        children.media,
-        children.parts,
-        state.differential,
-    )
-    log = queues.append(tree.segments, logged, kept)
+    log, logged = tree.segments, None
+    if log.items is not None:
+        logged = _segments(live.state, live.segments, children.media, children.parts)
+        index = log.count + jnp.cumsum(kept, dtype=jnp.int32) - 1
+        children = children._replace(live=live._replace(segments=index))
+    log = queues.append(log, logged, kept)
     dropped = queues.add_dropped(tree.dropped, live.rays, live.throughput, children.exists & ~kept)
-    children = children._replace(live=live._replace(segments=index), exists=kept)
-    return tree._replace(segments=log, dropped=dropped), children
+    return tree._replace(segments=log, dropped=dropped), children._replace(exists=kept)
+
+
+def _segments(
+    state: RayState,
+    parents: Int[Array, " n"] | None,
+    media: Int[Array, " n"],
+    parts: Int[Array, " n"],
+) -> Segments:
+    """Returns the current segments of rays."""
+    parents = cast(Array, parents)
+    line = state.point, state.direction, state.tau
+    return Segments(parents, *line, media, parts, state.differential)
+
+
+def _last_segments(live: Live) -> LastSegments | None:
+    """Returns the current segments of rays, if no others are stored."""
+    if live.media is None:
+        return None
+    state = live.state
+    return LastSegments(state.point, state.direction, state.tau, live.media, state.differential)
 
 
 def push_or_end(
@@ -179,7 +200,8 @@ def end(
     if like is not None and stop is None:
         tau = jnp.full_like(live.state.tau, jnp.inf)
         stop = Stop(tau, None if like.radiance is None else jnp.zeros_like(live.throughput))
-    block = Ends(live.segments, live.rays, live.throughput, live.state.num_bends, status, stop)
+    state, last = live.state, _last_segments(live)
+    block = Ends(live.segments, live.rays, live.throughput, state.num_bends, status, stop, last)
     return tree._replace(ends=queues.append(tree.ends, block, ending))
 
 
@@ -205,6 +227,7 @@ def follow(
     settings: PathSettings,
     footprint: Footprint = "cone",
     block: int | None = None,
+    stored: bool = True,
 ) -> PathTree:
     """Traces each ray along all branches; every child has one bend more than its parent.
 
@@ -216,46 +239,68 @@ def follow(
       settings: path settings, with at least one bend.
       footprint: `differential` carries derivatives across the pixel.
       block: number of rays cast per iteration; by default what suits the platform.
+      stored: whether segments are stored; otherwise only the last one of each path.
     """
-    return _follow(settings, footprint, block, scene, rays, interior_list)
+    return _follow(settings, footprint, block, stored, scene, rays, interior_list)
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2))
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2, 3))
 def _follow(
     settings: PathSettings,
     footprint: Footprint,
     block: int | None,
+    stored: bool,
     scene: Scene,
     rays: Rays,
     interior_list: Int[Array, "rays slots"],
 ) -> PathTree:
+    kind = _Kind(settings, footprint, stored)
     if block is not None:
-        return _in_blocks(scene, rays, interior_list, settings, footprint, block)
-    return _as_platform_likes(scene, rays, interior_list, settings=settings, footprint=footprint)
+        return _in_blocks(scene, rays, interior_list, kind, block)
+    return _as_platform_likes(scene, rays, interior_list, kind=kind)
+
+
+class _Kind(NamedTuple):
+    """What is traced, and what is kept of it; arguments of `follow`."""
+
+    settings: PathSettings
+    footprint: Footprint
+    stored: bool = True
 
 
 def _in_blocks(
     scene: Scene,
     rays: Rays,
     interior_list: Int[Array, "rays slots"],
-    settings: PathSettings,
-    footprint: Footprint,
+    kind: _Kind,
     block: int,
 ) -> PathTree:
     count = rays.radii.shape[0]
     block = max(1, min(block, count))
-    capacities = path_settings.capacities(settings, count)
-    walk = _begin(scene, rays, interior_list, footprint, block, capacities)
+    capacities = _capacities(kind.settings, count, block)
+    walk = _begin(scene, rays, interior_list, kind, block, capacities)
     if count < _MANY_BLOCKS * block or block < _SMALLER:
-        return _trace_remaining(scene, walk, settings, block, capacities, least=1).tree
+        return _trace_remaining(scene, walk, kind.settings, block, capacities, least=1).tree
     # Otherwise the few deepest rays would cast a full block in each iteration.
-    walk = _trace_remaining(scene, walk, settings, block, capacities, least=block // 4)
+    walk = _trace_remaining(scene, walk, kind.settings, block, capacities, least=block // 4)
     stack = queues.append(
         walk.stack, walk.next.items, jnp.arange(block, dtype=jnp.int32) < walk.next.count
     )
     small = block // _SMALLER
     walk = _Walk(*queues.pop(stack, small), walk.tree)
-    return _trace_remaining(scene, walk, settings, small, capacities, least=1).tree
+    return _trace_remaining(scene, walk, kind.settings, small, capacities, least=1).tree
+
+
+def _capacities(settings: PathSettings, count: int, block: int) -> Capacities:
+    """Returns the capacities for some rays, without what their stack cannot fill.
+
+    Each iteration pushes at most `2 * block` children. While some of them are on the stack, all
+    that are pushed above them have more bends than the ones with the fewest bends among them. So
+    there are never more such groups than bends, above the camera rays.
+    """
+    capacities = path_settings.capacities(settings, count)
+    most = count + 2 * block * settings.max_bends
+    return capacities._replace(live=min(capacities.live, most))
 
 
 def _in_cached_blocks(
@@ -263,10 +308,9 @@ def _in_cached_blocks(
     rays: Rays,
     interior_list: Int[Array, "rays slots"],
     *,
-    settings: PathSettings,
-    footprint: Footprint,
+    kind: _Kind,
 ) -> PathTree:
-    return _in_blocks(scene, rays, interior_list, settings, footprint, _BLOCK_ON_CPU)
+    return _in_blocks(scene, rays, interior_list, kind, _BLOCK_ON_CPU)
 
 
 def _at_once(
@@ -274,12 +318,11 @@ def _at_once(
     rays: Rays,
     interior_list: Int[Array, "rays slots"],
     *,
-    settings: PathSettings,
-    footprint: Footprint,
+    kind: _Kind,
 ) -> PathTree:
     """Traces all rays as one block, with lists as long as those of `_in_cached_blocks`."""
-    tree = _in_blocks(scene, rays, interior_list, settings, footprint, _BLOCK)
-    like = _empty(scene, rays, interior_list, settings=settings, footprint=footprint)
+    tree = _in_blocks(scene, rays, interior_list, kind, _BLOCK)
+    like = _empty(scene, rays, interior_list, kind=kind)
     return jax.tree.map(lambda x, y: x[: y.shape[0]] if y.ndim else x, tree, like)
 
 
@@ -288,14 +331,13 @@ def _empty(
     rays: Rays,
     interior_list: Int[Array, "rays slots"],
     *,
-    settings: PathSettings,
-    footprint: Footprint,
+    kind: _Kind,
 ) -> PathTree:
     """Returns the path tree of `_in_cached_blocks` before any ray is cast."""
     count = rays.radii.shape[0]
     block = max(1, min(_BLOCK_ON_CPU, count))
-    capacities = path_settings.capacities(settings, count)
-    return _begin(scene, rays, interior_list, footprint, block, capacities).tree
+    capacities = _capacities(kind.settings, count, block)
+    return _begin(scene, rays, interior_list, kind, block, capacities).tree
 
 
 _as_platform_likes = chosen_by_platform(
@@ -338,10 +380,11 @@ def _refuse_gradients(
     settings: PathSettings,
     footprint: Footprint,
     block: int | None,
+    stored: bool,
     primals: object,
     tangents: object,
 ) -> NoReturn:
-    del settings, footprint, block, primals, tangents
+    del settings, footprint, block, stored, primals, tangents
     raise TypeError(
         "Light paths of trace have no derivatives with respect to rays or the scene. Use "
         "follow_branch or follow_main_branches, or hold rays and the scene constant with "
@@ -363,25 +406,25 @@ def _begin(
     scene: Scene,
     rays: Rays,
     interior_list: Int[Array, "rays slots"],
-    footprint: Footprint,
+    kind: _Kind,
     block: int,
     capacities: Capacities,
 ) -> _Walk:
     """Pushes the camera rays on the stack and stores their segments."""
     count = rays.radii.shape[0]
     order = jnp.arange(count, dtype=jnp.int32)
-    differential = jax.vmap(lambda ray: ray_differentials.begin(ray, footprint))(rays)
+    differential = jax.vmap(lambda ray: ray_differentials.begin(ray, kind.footprint))(rays)
     state = jax.vmap(path_step.begin)(rays, interior_list, differential)
     if media.has_dispersion(scene.interfaces):  # three rays follow each other, one per channel
         channels = jnp.eye(3, dtype=state.throughput.dtype)
         state = state._replace(throughput=channels[order % 3])
     ambient = jnp.full_like(order, media.AMBIENT)
-    first = jnp.full_like(order, NO_SEGMENT)
-    nowhere = jnp.full_like(order, media.EMPTY_SLOT)
-    segments = Segments(
-        first, state.point, state.direction, state.tau, ambient, nowhere, state.differential
-    )
-    ends = Ends(order, order, state.throughput, order, order, _no_stop(scene, state))
+    live, segments = Live(state, order, None, ambient), None
+    if kind.stored:
+        first, nowhere = jnp.full_like(order, NO_SEGMENT), jnp.full_like(order, media.EMPTY_SLOT)
+        live, segments = Live(state, order, order), _segments(state, first, ambient, nowhere)
+    stop, last = _no_stop(scene, state), _last_segments(live)
+    ends = Ends(live.segments, order, state.throughput, order, order, stop, last)
     # Each buffer has slots beyond its capacity for the records that one iteration may append.
     tree = PathTree(
         segments=queues.fill(segments, count, capacities.segments + 2 * block),
@@ -389,7 +432,7 @@ def _begin(
         dropped=jnp.zeros_like(rays.origins),
         casts=jnp.zeros((), jnp.int32),
     )
-    stack = queues.fill(Live(state, order, order), count, capacities.live + 2 * block)
+    stack = queues.fill(live, count, capacities.live + 2 * block)
     return _Walk(*queues.pop(stack, block), tree)
 
 
@@ -407,7 +450,11 @@ def _trace_block(
     tree = walk.tree._replace(casts=walk.tree.casts + jnp.sum(alive, dtype=jnp.int32))
     medium = arrival.interaction.sides.medium_near
     # The medium of a camera is known only from the first surface it sees.
-    tree = path_tree.set_media(tree, live.segments, medium, hit & (live.state.num_bends == 0))
+    seen = hit & (live.state.num_bends == 0)
+    if live.media is None:
+        tree = path_tree.set_media(tree, live.segments, medium, seen)
+    else:
+        live = live._replace(media=jnp.where(seen, medium, live.media))
     ended, stop = jax.vmap(path_step.stop)(live.state, arrival, status)
     tree = end_by(settings, tree, live._replace(state=ended), status, alive & ~bending, stop)
     branches = jax.vmap(functools.partial(path_step.branch, settings))(

@@ -260,6 +260,37 @@ def test_the_tree_holds_every_face_once_and_bounds_it(faces):
         assert table[-1, 7] == -1
 
 
+def _cheapest_split(lower, upper):
+    """Returns the least cost of a split along one axis, of boxes in their order, by brute force."""
+
+    def cost(part):
+        x, y, z = upper[part].max(axis=0) - lower[part].min(axis=0)
+        return (x * y + y * z + z * x) * -(-len(part) // bvh.LEAF_SIZE)
+
+    count = len(lower)
+    costs = [cost(range(n)) + cost(range(n, count)) for n in range(1, count)]
+    at_least = np.flatnonzero(np.array(costs) <= min(costs) * (1 + 1e-9)) + 1
+    return min(costs), at_least[np.argmin(np.abs(2 * at_least - count))]
+
+
+# Nodes of one column and of several, of one size and of many.
+@pytest.mark.parametrize("counts", [[2], [8, 9, 5], [300], [7, 200, 64, 2, 65, 500], [6] * 40])
+def test_every_split_is_the_cheapest(counts):
+    generator = np.random.default_rng(sum(counts))
+    lower = generator.uniform(-1, 1, (sum(counts), 3)).astype(np.float32)
+    upper = lower + generator.uniform(0, 0.3, lower.shape).astype(np.float32)
+    node = np.repeat(np.arange(len(counts)), counts)
+    orders = [np.lexsort((along, node)) for along in (lower + upper).T]
+    reach = np.ascontiguousarray(np.concatenate([upper, -lower], axis=1).T)
+    left, axis = bvh_build.best_splits(orders, np.array(counts), reach)
+    for index, (chosen, place) in enumerate(zip(axis, left, strict=True)):
+        ordered = [order[node[order] == index] for order in orders]
+        exact = [(lower[each].astype(float), upper[each].astype(float)) for each in ordered]
+        found = [_cheapest_split(*boxes) for boxes in exact]
+        assert chosen == np.argmin([cost for cost, _ in found])
+        assert place == found[chosen][1]
+
+
 def test_a_coordinate_that_is_not_finite_is_an_error():
     triangles = _soup(3)
     triangles[1, 2, 0] = np.nan

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-from refref_jax.optics import media, path_tracing, wavefront
+from refref_jax.optics import media, path_tracing, path_tree, wavefront
 from refref_jax.optics.light_paths import PathStatus
 from refref_jax.optics.path_settings import PAPER, PATH_PRESETS, TREE, PathSettings, capacities
 from tests.factories import scenes
@@ -245,6 +245,37 @@ def test_accelerators_cast_all_rays_at_once_into_lists_of_the_same_size(monkeypa
     assert once.casts == in_blocks.casts and once.ends.count == in_blocks.ends.count
     found = [np.sort(tree.ends.items.throughput[: tree.ends.count, 0]) for tree in trees]
     np.testing.assert_allclose(*found, rtol=1e-5)
+
+
+@pytest.mark.parametrize("segments_per_ray", [2.0, 90.0])
+def test_last_segments_are_the_same_if_others_are_not_stored(segments_per_ray):
+    scene, rays = scenes.build(scenes.box((1.0, 1.2, 1.4))), _towards_a_ball(32)
+    settings = dataclasses.replace(_generous(TREE), max_bends=4, segments_per_ray=segments_per_ray)
+    inside = np.broadcast_to(np.asarray(media.empty_interior_list(scene.interfaces)), (32, 0))
+    found = []
+    for stored in (True, False):
+        follow = functools.partial(wavefront.follow, settings=settings, stored=stored)
+        tree = jax.jit(follow)(scene, rays, inside)
+        ends = path_tree.listed(tree, capacities(settings, 32).paths)
+        found.append((path_tree.last_segments(tree.segments.items, ends), tree.dropped, tree.casts))
+        assert (tree.segments.items is not None) == stored
+    there = found[0][0].statuses != PathStatus.EMPTY
+    assert (found[0][1].max() > 0.0) == (segments_per_ray < 90.0)
+    for one, other in zip(jax.tree.leaves(found[0]), jax.tree.leaves(found[1]), strict=True):
+        assert np.all(np.isfinite(other))
+        pick = there if len(one.shape) and len(one) == len(there) else ...
+        np.testing.assert_array_equal(one[pick], other[pick])
+
+
+def test_a_stack_holds_as_many_rays_as_there_can_be():
+    scene, rays = scenes.build(scenes.box((1.0, 1.2, 1.4))), _towards_a_ball(16)
+    settings = dataclasses.replace(_generous(TREE), max_bends=6, min_throughput=0.0)
+    assert wavefront._capacities(settings, 16, 1).live == 16 + 2 * 6
+    assert wavefront._capacities(settings, 16, 16).live == 16 + 2 * 16 * 6
+    assert wavefront._capacities(settings, 16, 512).live == capacities(settings, 16).live
+    for block in (1, 4):
+        ends, traced = _ends(scene, rays, settings=settings, block=block)
+        assert len(ends.rays) > 16 * 6 and np.all(traced.dropped == 0.0)
 
 
 @pytest.mark.slow
