@@ -40,12 +40,6 @@ from refref_jax.optics.scene import Scene
 # accelerator a block of many rays costs as much as one of few, so all rays are one block.
 _BLOCK_ON_CPU, _BLOCK = 1024, 1 << 20
 
-# From this number of blocks, the last rays are cast in smaller blocks, by a second compiled loop.
-_MANY_BLOCKS = 6
-
-# Ratio of the two block sizes; blocks of fewer rays than this have no second loop.
-_SMALLER = 16
-
 
 class Live(NamedTuple):
     """Active rays, which are still to be cast.
@@ -279,16 +273,7 @@ def _in_blocks(
     block = max(1, min(block, count))
     capacities = _capacities(kind.settings, count, block)
     walk = _begin(scene, rays, interior_list, kind, block, capacities)
-    if count < _MANY_BLOCKS * block or block < _SMALLER:
-        return _trace_remaining(scene, walk, kind.settings, block, capacities, least=1).tree
-    # Otherwise the few deepest rays would cast a full block in each iteration.
-    walk = _trace_remaining(scene, walk, kind.settings, block, capacities, least=block // 4)
-    stack = queues.append(
-        walk.stack, walk.next.items, jnp.arange(block, dtype=jnp.int32) < walk.next.count
-    )
-    small = block // _SMALLER
-    walk = _Walk(*queues.pop(stack, small), walk.tree)
-    return _trace_remaining(scene, walk, kind.settings, small, capacities, least=1).tree
+    return _trace_remaining(scene, walk, kind.settings, block, capacities).tree
 
 
 def _capacities(settings: PathSettings, count: int, block: int) -> Capacities:
@@ -351,13 +336,11 @@ def _trace_remaining(
     settings: PathSettings,
     block: int,
     capacities: Capacities,
-    *,
-    least: int,
 ) -> _Walk:
-    """Casts blocks until fewer than `least` rays are left."""
+    """Casts blocks until no rays are left."""
 
     def more(walk: _Walk) -> Bool[Array, ""]:
-        return walk.next.count + walk.stack.count >= least
+        return walk.next.count > 0
 
     def fits(walk: _Walk) -> Bool[Array, ""]:
         return (walk.stack.count <= capacities.live) & (walk.tree.ends.count <= capacities.paths)
