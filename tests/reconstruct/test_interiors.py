@@ -103,7 +103,7 @@ def test_the_number_of_faces_does_not_depend_on_the_level(body):
     assert len(counts) == 1
 
 
-@pytest.mark.parametrize("deviation", [0.0, 0.03])
+@pytest.mark.parametrize("deviation", [pytest.param(0.0, marks=pytest.mark.slow), 0.03])
 def test_a_given_index_is_kept(body, surface, small_tiles, deviation):
     del small_tiles
     seen = vessels.photographs(Vessel(body, Interior("air", wall=0.15), _SMALL), surface)
@@ -234,6 +234,7 @@ def test_level_index_and_tint_are_recovered(body, surface, photographs):
     assert found.tint == pytest.approx(_FLASK.tint, abs=0.02)
 
 
+@pytest.mark.slow
 def test_an_absorbing_liquid_is_told_from_a_tinted_surface(body, surface):
     wine = dataclasses.replace(_FLASK, tint=(1.0, 1.0, 1.0), absorption=(0.1, 1.2, 0.8))
     seen = vessels.photographs(Vessel(body, wine, _SMALL), surface)
@@ -260,6 +261,7 @@ def test_the_simplest_of_equally_good_findings_is_kept(body, surface, photograph
     assert _simplest([wrong, simple, stained]) is simple
 
 
+@pytest.mark.slow
 def test_levels_are_looked_at_again_with_both_mouths(body, surface, photographs, monkeypatch):
     levels_and_gaps = interior_search._VARIANTS[:2]
     monkeypatch.setattr(interior_search, "_VARIANTS", levels_and_gaps)

@@ -177,7 +177,14 @@ def _ball_mesh(ball):
     return mesh_of(ball.pose(ball.start()))
 
 
-@pytest.mark.parametrize("space", ["bounded", "spherical", "unbounded"])
+@pytest.mark.parametrize(
+    "space",
+    [
+        "bounded",
+        pytest.param("spherical", marks=pytest.mark.slow),
+        pytest.param("unbounded", marks=pytest.mark.slow),
+    ],
+)
 def test_predictions_are_those_of_a_ball_in_closed_form(glass, space):
     surface = _world(space)
     rays, _ = _rays(4)
@@ -457,6 +464,7 @@ def test_a_family_is_chosen_where_it_explains_the_judges(world, ball, seen, judg
     assert told == sorted(told) and told[-1] == 1.0 and 0.0 < told[0] < 0.2
 
 
+@pytest.mark.slow
 def test_before_a_grey_wall_the_body_stays_as_it_is(ball, seen, judges, monkeypatch):
     grey = _world(pyramid=backdrop.init(_SIDE, radiance=0.4))
     pixels, others = (
