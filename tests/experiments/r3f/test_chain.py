@@ -482,7 +482,8 @@ def test_a_field_inside_learns_what_a_shape_leaves_unexplained(
     shutil.copytree(whole, made)
     light = records.LightFacts(kept=True, index=1.5, before=0.11, after=after)
     records.write(made, dataclasses.replace(records.read(made), light=light))
-    config = TrainConfig().override(**({"interior": given} if given else {}))
+    options = {"interior": given} if given else {}
+    config = TrainConfig().override(reconstruction=str(made), **options)
     parts = [scenes.ball(1.0, subdivisions=1)]
     config = training_body.with_parts(config, parts, made, ior=(), say=said.append)
     assert config.model.interior == interior
