@@ -117,7 +117,7 @@ def trace_ends(
         settings=settings,
         footprint=footprint,
         block=block,
-        stored=False,
+        segments="last",
     )
     ends = path_tree.listed(tree, capacities(settings, rays.radii.shape[0]).paths)
     last = path_tree.last_segments(tree.segments.items, ends)

@@ -18,7 +18,7 @@ with surfaces.
 """
 
 import functools
-from typing import NamedTuple, NoReturn, cast
+from typing import Literal, NamedTuple, NoReturn, cast
 
 import jax
 import jax.numpy as jnp
@@ -35,6 +35,8 @@ from refref_jax.optics.path_step import Arrival, Branches, RayState
 from refref_jax.optics.path_tree import NO_SEGMENT, Ends, LastSegments, PathTree, Segments
 from refref_jax.optics.queues import Queue
 from refref_jax.optics.scene import Scene
+
+StoredSegments = Literal["all", "last"]
 
 # Number of rays cast per iteration: a core's cache holds so many, with their children. On an
 # accelerator a block of many rays costs as much as one of few, so all rays are one block.
@@ -221,7 +223,7 @@ def follow(
     settings: PathSettings,
     footprint: Footprint = "cone",
     block: int | None = None,
-    stored: bool = True,
+    segments: StoredSegments = "all",
 ) -> PathTree:
     """Traces each ray along all branches; every child has one bend more than its parent.
 
@@ -233,9 +235,9 @@ def follow(
       settings: path settings, with at least one bend.
       footprint: `differential` carries derivatives across the pixel.
       block: number of rays cast per iteration; by default what suits the platform.
-      stored: whether segments are stored; otherwise only the last one of each path.
+      segments: segments to store, `all` or the `last` one of each path.
     """
-    return _follow(settings, footprint, block, stored, scene, rays, interior_list)
+    return _follow(settings, footprint, block, segments, scene, rays, interior_list)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2, 3))
@@ -243,12 +245,12 @@ def _follow(
     settings: PathSettings,
     footprint: Footprint,
     block: int | None,
-    stored: bool,
+    segments: StoredSegments,
     scene: Scene,
     rays: Rays,
     interior_list: Int[Array, "rays slots"],
 ) -> PathTree:
-    kind = _Kind(settings, footprint, stored)
+    kind = _Kind(settings, footprint, segments)
     if block is not None:
         return _in_blocks(scene, rays, interior_list, kind, block)
     return _as_platform_likes(scene, rays, interior_list, kind=kind)
@@ -259,7 +261,7 @@ class _Kind(NamedTuple):
 
     settings: PathSettings
     footprint: Footprint
-    stored: bool = True
+    segments: StoredSegments = "all"
 
 
 def _in_blocks(
@@ -363,11 +365,11 @@ def _refuse_gradients(
     settings: PathSettings,
     footprint: Footprint,
     block: int | None,
-    stored: bool,
+    segments: StoredSegments,
     primals: object,
     tangents: object,
 ) -> NoReturn:
-    del settings, footprint, block, stored, primals, tangents
+    del settings, footprint, block, segments, primals, tangents
     raise TypeError(
         "Light paths of trace have no derivatives with respect to rays or the scene. Use "
         "follow_branch or follow_main_branches, or hold rays and the scene constant with "
@@ -403,7 +405,7 @@ def _begin(
         state = state._replace(throughput=channels[order % 3])
     ambient = jnp.full_like(order, media.AMBIENT)
     live, segments = Live(state, order, None, ambient), None
-    if kind.stored:
+    if kind.segments == "all":
         first, nowhere = jnp.full_like(order, NO_SEGMENT), jnp.full_like(order, media.EMPTY_SLOT)
         live, segments = Live(state, order, order), _segments(state, first, ambient, nowhere)
     stop, last = _no_stop(scene, state), _last_segments(live)

@@ -236,8 +236,9 @@ def test_accelerators_cast_all_rays_at_once_into_lists_of_the_same_size(monkeypa
     scene, rays = scenes.build(scenes.box((1.0, 1.2, 1.4))), _towards_a_ball(32)
     settings = dataclasses.replace(TREE, max_bends=2)
     inside = np.broadcast_to(np.asarray(media.empty_interior_list(scene.interfaces)), (32, 0))
+    kind = wavefront._Kind(settings, "cone")
     trees = [
-        jax.jit(functools.partial(follow, settings=settings, footprint="cone"))(scene, rays, inside)
+        jax.jit(functools.partial(follow, kind=kind))(scene, rays, inside)
         for follow in (wavefront._at_once, wavefront._in_cached_blocks)
     ]
     once, in_blocks = trees
@@ -253,12 +254,12 @@ def test_last_segments_are_the_same_if_others_are_not_stored(segments_per_ray):
     settings = dataclasses.replace(_generous(TREE), max_bends=4, segments_per_ray=segments_per_ray)
     inside = np.broadcast_to(np.asarray(media.empty_interior_list(scene.interfaces)), (32, 0))
     found = []
-    for stored in (True, False):
-        follow = functools.partial(wavefront.follow, settings=settings, stored=stored)
+    for segments in ("all", "last"):
+        follow = functools.partial(wavefront.follow, settings=settings, segments=segments)
         tree = jax.jit(follow)(scene, rays, inside)
         ends = path_tree.listed(tree, capacities(settings, 32).paths)
         found.append((path_tree.last_segments(tree.segments.items, ends), tree.dropped, tree.casts))
-        assert (tree.segments.items is not None) == stored
+        assert (tree.segments.items is not None) == (segments == "all")
     there = found[0][0].statuses != PathStatus.EMPTY
     assert (found[0][1].max() > 0.0) == (segments_per_ray < 90.0)
     for one, other in zip(jax.tree.leaves(found[0]), jax.tree.leaves(found[1]), strict=True):
