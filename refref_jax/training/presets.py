@@ -72,8 +72,12 @@ _PUBLISHED_NEAR = 0.05 * _PUBLISHED_UNIT
 _PUBLISHED_FAR = 15.0 * _PUBLISHED_UNIT
 _PUBLISHED_FAR_UNBOUNDED = 1000.0 * _PUBLISHED_UNIT
 
-# Radius of the ball of a surface, in distances of the nearest camera.
+# Radius of the ball of a surface, in distances of the nearest camera: 2.2 world units in the data
+# set, whose objects end at 2.1. In a larger ball, each camera could see a part of it by itself.
 _BALL = 0.55
+
+# Mean squared sine of the angles to a common axis below which optical axes are parallel.
+_PARALLEL = 1e-3
 
 # Blur of the interlevel loss for each proposal level (Zip-NeRF, supplement).
 _BLURS = (0.03, 0.003)
@@ -214,12 +218,14 @@ def place_surface(model: ModelConfig, cameras: Cameras) -> ModelConfig:
         )
     positions, axes = cameras.poses[:, :, 3], -cameras.poses[:, :, 2]
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    focus = np.linalg.lstsq(across.sum(0), np.einsum("nij,nj->i", across, positions))[0]
+    spread, towards = across.mean(0), np.einsum("nij,nj->i", across, positions) / len(axes)
+    focus = np.linalg.lstsq(spread, towards)[0]
     depths = np.sum((focus - positions) * axes, axis=-1)
     nearest = float(np.min(np.linalg.norm(positions - focus, axis=-1)))
     beyond = float(np.max(np.abs(focus - model.centre)))
     radius = min(_BALL * nearest, model.radius - beyond)
-    if radius <= 0.0 or not np.all(depths > 0.0):
+    parallel = np.linalg.eigvalsh(spread)[0] < _PARALLEL
+    if parallel or radius <= 0.0 or not np.all(depths > 0.0):
         raise ValueError(
             f"field={field.kind} needs cameras around an object, but these do not all look at one "
             "place in the scene. Use field=zipnerf."
