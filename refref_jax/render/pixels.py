@@ -111,8 +111,8 @@ def render_paths(
         front = render(params, config, paths, jitter, anneal)
         behind = jax.vmap(volume_rendering.in_front_of)(front.composite, seen.rgb, seen.mean)
         return front._replace(composite=behind)
-    render = jax.vmap(volume_rendering.path_radiance, in_axes=(None, None, 0, 0, None, None))
-    return render(params, config, paths, jitter, anneal, progress)
+    one = functools.partial(volume_rendering.path_radiance, progress=progress)
+    return jax.vmap(one, in_axes=(None, None, 0, 0, None))(params, config, paths, jitter, anneal)
 
 
 def _see_backdrop(params: Params, config: ModelConfig, paths: LightPaths) -> Composite:

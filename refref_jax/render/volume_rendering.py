@@ -180,6 +180,7 @@ def path_radiance(
     path: LightPaths,
     jitter: Jitter,
     anneal: Float[Array, ""],
+    *,
     progress: Float[Array, ""] | None = None,
 ) -> PathRadiance:
     """Renders one light path.

@@ -255,7 +255,8 @@ def _step(
 
     def combine(params: Params, totals: Totals) -> tuple[Float[Array, ""], StepReport]:
         target = rgb.astype(jnp.float32) / 255.0
-        report = objective.measure(params, totals, target, traced.dropped, config.losses, progress)
+        losses, dropped = config.losses, traced.dropped
+        report = objective.measure(params, totals, target, dropped, losses, progress=progress)
         return report.loss, report
 
     # The sums over paths are summed over devices between the two halves.

@@ -172,6 +172,7 @@ def measure(
     target: Float[Array, "rays 3"],
     dropped: Float[Array, "rays 3"],
     config: LossConfig,
+    *,
     progress: Float[Array, ""] | None = None,
 ) -> StepReport:
     """Returns the losses of a batch; losses of paths are averaged over the included paths.

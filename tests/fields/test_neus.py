@@ -30,15 +30,16 @@ _UNISURF = neus.UnisurfConfig(
     _GRID, density_width=8, bottleneck=4, colour_width=8, colour_depth=1, around=_GRID
 )
 
+_TOWARDS = jnp.array([0.36, 0.48, 0.8], jnp.float32)
+
 # Rounding of a logarithm in float32.
 _ROUNDING = 1e-6
 
 
 def _trained(config, size=0.6):
     """Returns parameters as after training: large entries, and biases that are not 0."""
-    shapes = jax.eval_shape(lambda: neus.init_radiance(jax.random.key(0), config))
-    rng = np.random.default_rng(1)
-    return jax.tree.map(lambda x: jnp.asarray(size * rng.normal(size=x.shape), jnp.float32), shapes)
+    initial, rng = _initial(config), np.random.default_rng(1)
+    return jax.tree.map(lambda x: jnp.float32(size * rng.normal(size=x.shape)), initial)
 
 
 def _initial(config):
@@ -47,10 +48,6 @@ def _initial(config):
 
 def _at(point):
     return Gaussians(jnp.asarray(point, jnp.float32)[None], jnp.zeros(1, jnp.float32))
-
-
-def _direction():
-    return jnp.array([0.36, 0.48, 0.8], jnp.float32)
 
 
 # --- signed values of solids, in float64: value, gradient ---
@@ -219,7 +216,7 @@ def test_a_ray_that_leaves_is_not_stopped(length):
 @pytest.mark.parametrize("config", [_NEUS, _UNISURF], ids=["neus", "unisurf"])
 def test_beyond_the_ball_there_is_a_density(config):
     seen = _seen(-0.2, [0.0, 0.0, 1.0], within=False)
-    np.testing.assert_allclose(_depth(config, seen, _direction(), 2.0), 1.4, rtol=1e-6)
+    np.testing.assert_allclose(_depth(config, seen, _TOWARDS, 2.0), 1.4, rtol=1e-6)
 
 
 @pytest.mark.parametrize("config", [_NEUS, _UNISURF], ids=["neus", "unisurf"])
@@ -231,7 +228,7 @@ def test_depth_of_an_occupancy_ignores_length_and_slope():
     for signed in (-6.0, -0.3, 0.0, 0.2, 6.0):
         occupied = scipy.special.expit(-10.0 * signed)
         for length, slope in [(0.1, [0.0, 0.0, 1.0]), (7.0, [3.0, 0.0, 0.0])]:
-            depth = _depth(_UNISURF, _seen(signed, slope), _direction(), length)
+            depth = _depth(_UNISURF, _seen(signed, slope), _TOWARDS, length)
             wanted = np.logaddexp(0.0, -10.0 * signed)
             np.testing.assert_allclose(depth, wanted, rtol=_ROUNDING)
             np.testing.assert_allclose(-np.expm1(-depth), occupied, rtol=2e-6)
@@ -253,9 +250,9 @@ def test_intervals_are_finite_with_their_gradients(config, log_sharpness, length
         params = params._replace(log_sharpness=jnp.float32(log_sharpness))
 
     def stopped(params, point):
-        seen = neus.radiance(params, config, _at(point), _direction())
+        seen = neus.radiance(params, config, _at(point), _TOWARDS)
         depth = registry.depth(
-            params, config, seen, -_direction(), jnp.float32(length), jnp.float32(1.0)
+            params, config, seen, -_TOWARDS, jnp.float32(length), jnp.float32(1.0)
         )
         return -jnp.expm1(-depth) + jnp.sum(seen.rgb), depth
 
@@ -294,7 +291,7 @@ def test_the_laplacian_of_a_ball_is_two_over_the_radius():
 @pytest.mark.parametrize("config", [_NEUS, _UNISURF], ids=["neus", "unisurf"])
 def test_an_untrained_field_is_a_ball(config):
     params, centre = _initial(config), np.asarray(config.ball_centre)
-    see = jax.jit(lambda point: neus.radiance(params, config, _at(point), _direction()))
+    see = jax.jit(lambda point: neus.radiance(params, config, _at(point), _TOWARDS))
     for offset in ([0.0, 0.03, 0.1], [0.1, -0.05, 0.0], [-0.2, 0.1, 0.05]):
         seen = see(jnp.asarray(centre + offset))
         distance = np.linalg.norm(offset) / 0.25
@@ -312,7 +309,7 @@ def test_only_the_field_of_a_place_learns_there():
     params = _trained(_NEUS)
 
     def seen(params, point):
-        found = neus.radiance(params, _NEUS, _at(point), _direction())
+        found = neus.radiance(params, _NEUS, _at(point), _TOWARDS)
         return jnp.sum(found.rgb)
 
     slopes = jax.jit(jax.grad(seen))
@@ -327,8 +324,8 @@ def test_beyond_the_ball_it_is_zipnerf():
     shape = zipnerf.RadianceFieldConfig(
         _GRID, density_width=8, bottleneck=4, colour_width=8, colour_depth=1
     )
-    ours = neus.radiance(params, _NEUS, _at([0.9, 0.5, 0.5]), _direction())
-    theirs = zipnerf.radiance(params.around, shape, _at([0.9, 0.5, 0.5]), _direction())
+    ours = neus.radiance(params, _NEUS, _at([0.9, 0.5, 0.5]), _TOWARDS)
+    theirs = zipnerf.radiance(params.around, shape, _at([0.9, 0.5, 0.5]), _TOWARDS)
     np.testing.assert_array_equal(ours.rgb, theirs.rgb)
     np.testing.assert_array_equal(ours.density, theirs.density)
 

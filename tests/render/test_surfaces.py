@@ -66,7 +66,7 @@ def _straight(origin=(0.1, 0.2, -5.0)):
 def _seen(config, params, path=None, progress=None, anneal=0.0):
     path = jax.tree.map(jnp.asarray, _straight() if path is None else path)
     jitter = Jitter(jnp.zeros(2), jnp.zeros(2))
-    return _radiance(params, config, path, jitter, jnp.float32(anneal), progress)
+    return _radiance(params, config, path, jitter, jnp.float32(anneal), progress=progress)
 
 
 def test_the_distance_of_an_untrained_field_is_that_of_its_ball():
@@ -153,7 +153,7 @@ def test_paths_are_finite_with_their_gradients(config, size):
 
     def total(params):
         jitter = Jitter(jnp.zeros(2), jnp.zeros(2))
-        seen = volume_rendering.path_radiance(params, config, path, jitter, _ONE, _ONE)
+        seen = volume_rendering.path_radiance(params, config, path, jitter, _ONE)
         sums = sum(map(jnp.sum, seen.surface))
         moments = sum(jnp.sum(jnp.square(each.weights)) for each in seen.histograms)
         return jnp.sum(seen.composite.rgb) + sums + moments

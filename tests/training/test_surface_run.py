@@ -229,7 +229,8 @@ def test_commands_evaluate_and_export_the_surface(trained, tmp_path):
 def test_wrong_options_are_refused_before_anything_is_compiled(changes, message, monkeypatch):
     monkeypatch.setattr(jax, "jit", None)
     with pytest.raises(ValueError, match=message):
-        fit.prepare(_config(**changes), report=lambda line: None)
+        config = _config(**changes)
+        fit.prepare(config, report=lambda line: None)
 
 
 def test_weights_of_the_losses_are_those_of_the_kind():
