@@ -297,11 +297,12 @@ def test_an_untrained_field_is_a_ball(config):
         distance = np.linalg.norm(offset) / 0.25
         assert seen.within == (distance < 1.0)
         np.testing.assert_allclose(seen.signed, distance - 0.5, atol=2e-6)
-        normal = np.asarray(offset) / np.linalg.norm(offset)
         # Differences over a cell, a tenth of the box around the ball.
-        x, y, z = normal
-        bias = -np.array([y * z, z * x, x * y]) * 0.2 / distance
-        np.testing.assert_allclose(seen.slope, normal + bias, atol=0.25 * 0.2 / distance)
+        corners, step = np.asarray(hash_grid.TETRAHEDRON), 0.2
+        around, _ = _ball(np.asarray(offset) / 0.25 + step * corners)
+        np.testing.assert_allclose(seen.slope, around @ corners / (4.0 * step), atol=1e-5)
+        bend = np.sum(around - (distance - 0.5)) / (2.0 * step**2)
+        np.testing.assert_allclose(seen.curvature, bend, atol=1e-4)
     assert not see(jnp.asarray(centre + np.array([0.0, 0.0, 0.26]))).within
 
 
