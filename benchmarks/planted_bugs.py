@@ -261,6 +261,13 @@ BUGS = (
         ("render/test_sub_spaces.py::test_a_path_has_the_numbers_of_the_released_functions",),
     ),
     Bug(
+        "a surface stops light that leaves it",
+        "fields/neus.py",
+        "jax.nn.relu(-cosine) * head_on",
+        "jnp.abs(cosine) * head_on",
+        ("fields/test_neus.py::test_a_ray_that_leaves_is_not_stopped",),
+    ),
+    Bug(
         "transmittance includes the own sample",
         _VOLUME,
         "jnp.concatenate([jnp.zeros_like(depth[:1]), jnp.cumsum(depth[:-1])])",

@@ -3,7 +3,7 @@
 python -m experiments.export --run=runs/ball --what=mesh --out=ball.ply
 
     mesh      level set of the field's density at --level, and the background cube or sphere, if
-              any, with normals and colours
+              any, with normals and colours; of a field with a surface (neus, unisurf), that surface
     points    the same surfaces as points of a grid
     object    the objects: those of R3F, or the scene's meshes; with their shading normals
     textured_mesh  the cube, sphere or environment of a backdrop, as GLB
@@ -157,6 +157,8 @@ def _write_coverage(draft: Path, run: Path, *, is_exr: bool) -> None:
 
 def _write_field(model: Model, out: Path) -> list[Path]:
     grids.import_skimage()  # reports a missing package early
+    if registry.has_surface(model.config.field):
+        return _write_surface(model, out)
     space, radius = model.config.space, model.config.radius
     centre = np.array(model.config.centre)
     half = _BOX.value or radius
@@ -192,6 +194,42 @@ def _write_field(model: Model, out: Path) -> list[Path]:
             points = field_mesh.find_points(density, level=_LEVEL.value)
             colours = _colours(model, points.points, points.normals, density.spacing)
             field_mesh.write_points(draft, points, colours)
+            print(f"Points: {len(points.points)}")
+    return [out]
+
+
+def _write_surface(model: Model, out: Path) -> list[Path]:
+    """Writes the surface of a field that has one, without the background.
+
+    Raises:
+      ValueError: if --level is given, or there is no surface in the box.
+    """
+    kind = model.config.field.kind
+    if _LEVEL.present:
+        raise ValueError(
+            f"--level={_LEVEL.value:g} has no effect on fields of kind {kind}, whose surface is "
+            "where their signed value is 0. Leave it out."
+        )
+    low, high = field_mesh.surface_box(model, _BOX.value)
+    print(f"Box:    {low.round(3)} to {high.round(3)}, {_RESOLUTION.value} cells along each edge")
+    with ProgressBar("surface", _RESOLUTION.value + 1) as bar:
+        signed = field_mesh.sample_surface(
+            model,
+            low,
+            high,
+            resolution=_RESOLUTION.value,
+            step=lambda done, total: bar.show(done, "slices"),
+        )
+    with outputs.fresh_file(out, overwrite=_OVERWRITE.value) as draft:
+        if _WHAT.value == "mesh":
+            surface = field_mesh.zero_surface(signed)
+            _, _, rgb = field_mesh.look_up_surfaces(model, surface.vertices, -surface.normals)
+            field_mesh.write_surface(draft, surface, image_files.to_bytes(rgb))
+            print(f"Mesh:   {len(surface.vertices)} vertices, {len(surface.faces)} faces")
+        else:
+            points = field_mesh.outer_points(signed)
+            _, _, rgb = field_mesh.look_up_surfaces(model, points.points, -points.normals)
+            field_mesh.write_points(draft, points, image_files.to_bytes(rgb))
             print(f"Points: {len(points.points)}")
     return [out]
 

@@ -81,7 +81,7 @@ Paths = Literal["straight", "paper", "tree", "paper_no_reflection", "paper_no_ti
 PresetName = Literal["tiny", "small", "paper", "best"]
 """Sizes of a model and its training; see `training.presets`."""
 
-FieldName = Literal["zipnerf", "nerfacto", "msnerf"]
+FieldName = Literal["zipnerf", "nerfacto", "msnerf", "neus", "unisurf"]
 """Field kinds, the default first; see `fields.registry`."""
 
 FarField = Literal["field", "backdrop"]

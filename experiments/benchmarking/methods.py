@@ -23,7 +23,7 @@ with epy.lazy_imports():
     from refref_jax.fields import registry
     from refref_jax.training import presets
 
-Need = Literal["meshes", "masks", "colours", "backdrop"]
+Need = Literal["meshes", "masks", "colours", "backdrop", "walls"]
 Group = Literal["main", "baseline", "ablation of the oracle", "ablation of the tree"]
 
 RECONSTRUCTION = "reconstruction"
@@ -41,7 +41,7 @@ class Method:
       train: options of `experiments.train`.
       requires: requirements on a scene: `meshes` of its objects, `masks` of its training images,
         `colours` of all its parts in scene.json, `backdrop` if all light ends on its background
-        and nothing but that is learned.
+        and nothing but that is learned, `walls` if a cube or a sphere is around it.
       reconstructed: whether the objects come from R3F instead of the scene's meshes.
       published: row of the paper's tables with the same method, if there is one.
       evaluate: options of `experiments.evaluate`, in place of those of the benchmark.
@@ -91,6 +91,7 @@ def _varied(name: str, label: str, *options: str, colours: tuple[Need, ...] = ()
 
 
 _STRAIGHT = ("--paths=straight",)
+_NEUS, _UNISURF = (*_STRAIGHT, "--field=neus"), (*_STRAIGHT, "--field=unisurf")
 
 _ALL = (
     Method("straight", "Straight (Zip-NeRF)", "main", _STRAIGHT, (), False, "Zip-NeRF"),
@@ -103,6 +104,8 @@ _ALL = (
         False,
         "MS-NeRF",
     ),
+    Method("neus", "NeuS (our fields)", "baseline", _NEUS, requires=("walls",), published="NeuS"),
+    Method("unisurf", "UNISURF (our fields)", "baseline", _UNISURF, requires=("walls",)),
     Method("oracle", "Oracle (paper's paths)", "main", _ORACLE, published="Oracle"),
     Method(
         "oracle_as_published",

@@ -117,6 +117,7 @@ _WANTING: dict[Need, str] = {
     "masks": "its training images have no masks",
     "colours": "scene.json does not define the colours of all its parts",
     "backdrop": "it needs a field: a part is opaque, or its colours or its interior are unknown",
+    "walls": "its background is infinitely far away, but the method needs a cube or a sphere",
 }
 
 
@@ -229,9 +230,19 @@ def _unmet(listed: Scene, requires: set[Need]) -> set[Need]:
             found.add("colours")
         if find_tints(parts) == "learned" or any(map(_learns_inside, parts)):
             found.add("backdrop")
+    if "walls" in requires and _space(listed) == "unbounded":
+        found.add("walls")
     if "masks" in requires and _has_no_masks(scene):
         found.add("masks")
     return found
+
+
+def _space(listed: Scene) -> str:
+    """Returns the kind of a scene's background: that given with it, or its own."""
+    given = [word.removeprefix("--background=") for word in listed.options]
+    chosen = [kind for kind, word in zip(given, listed.options, strict=True) if kind != word]
+    own = scene_properties.read(Path(listed.path), overlay=listed.properties).space
+    return chosen[-1] if chosen else own
 
 
 def _learns_inside(part: PartDescription) -> bool:

@@ -3,6 +3,7 @@
 The density is sampled on a grid. A surface is a level set of the density, computed on its
 logarithm, since densities vary by orders of magnitude. It stays open at the borders of the grid.
 Inside objects that the model does not sample the density is 0: the field was never trained there.
+A field with a surface of its own (`--field=neus`) has a signed value in place of a density.
 """
 
 import functools
@@ -25,7 +26,7 @@ from refref_jax.reconstruct import grids
 from refref_jax.reconstruct.grids import Grid
 from refref_jax.render import Model, pixels
 from refref_jax.render.images import find_first_surface
-from refref_jax.render.model import look_up
+from refref_jax.render.model import ball_of, look_up, look_up_surface
 
 CHUNK = 1 << 15
 """Number of points per query."""
@@ -42,7 +43,7 @@ _STEEPNESS = 4.0
 
 
 class DensitySurface(NamedTuple):
-    """Level set of the density.
+    """Level set of the density, or of the signed value of a field.
 
     Attributes:
       vertices: positions, world units.
@@ -118,28 +119,107 @@ def look_up_points(
       directions: unit view directions; `None` if colours are not needed.
       width: edge of the cell around each point, world units.
     """
+    seen = _in_chunks(model, points, directions, functools.partial(_chunk, width=width))
+    return seen[0], seen[1]
+
+
+def _in_chunks(
+    model: Model,
+    points: Float[np.ndarray, "n 3"],
+    directions: Float[np.ndarray, "n 3"] | None,
+    look: Callable[..., tuple[jax.Array, ...]],
+) -> list[np.ndarray]:
+    """Returns what a compiled function returns for all points, as many at once as it takes."""
     if directions is None:
         directions = np.tile(_ASKEW, (len(points), 1))
-    densities, colours = [np.zeros(0, np.float32)], [np.zeros((0, 3), np.float32)]
-    for start in range(0, len(points), CHUNK):
+    parts = []
+    for start in range(0, max(len(points), 1), CHUNK):
         part = slice(start, start + CHUNK)
         count = len(points[part])
         # Padded, to avoid a second compilation.
         filled = [
-            np.pad(each[part].astype(np.float32), ((0, CHUNK - count), (0, 0)), mode="edge")
+            np.concatenate([each[part], np.zeros((CHUNK - count, 3))]).astype(np.float32)
             for each in (points, directions)
         ]
-        density, rgb = jax.device_get(_chunk(model.params, *filled, model.config, width))
-        densities.append(density[:count])
-        colours.append(rgb[:count])
-    return np.concatenate(densities), np.concatenate(colours)
+        seen = jax.device_get(look(model.params, *filled, config=model.config))
+        parts.append([each[:count] for each in seen])
+    return [np.concatenate(each) for each in zip(*parts, strict=True)]
 
 
-@functools.partial(jax.jit, static_argnums=(3, 4))
-def _chunk(params, points, directions, config, width):
+@functools.partial(jax.jit, static_argnames="config")
+def _surface_chunk(params, points, directions, *, config):
+    seen = jax.vmap(look_up_surface, in_axes=(None, None, 0, 0))(params, config, points, directions)
+    return seen.distance, seen.normal, jnp.clip(pixels.linear_to_srgb(seen.linear), 0.0, 1.0)
+
+
+@functools.partial(jax.jit, static_argnames=("config", "width"))
+def _chunk(params, points, directions, *, config, width):
     look = functools.partial(look_up, width=width)
     seen = jax.vmap(look, in_axes=(None, None, 0, 0))(params, config, points, directions)
     return seen.density, jnp.clip(pixels.linear_to_srgb(seen.linear), 0.0, 1.0)
+
+
+def sample_surface(
+    model: Model,
+    low: Float[np.ndarray, "3"],
+    high: Float[np.ndarray, "3"],
+    *,
+    resolution: int,
+    step: Callable[[int, int], None],
+) -> Grid:
+    """Samples the signed value of a field with a surface; arguments as in `sample_density`.
+
+    Returns:
+      Signed value in world units, positive on the border of the grid, where it is cut off.
+
+    Raises:
+      ValueError: if the field has no surface in the box.
+    """
+    spacing = float((high - low).max()) / resolution
+    counts = np.maximum(np.rint((high - low) / spacing), 1).astype(np.int64) + 1
+    axes = [low[i] + spacing * np.arange(counts[i]) for i in range(3)]
+    values = np.zeros(counts, np.float32)
+    for i, x in enumerate(axes[0]):
+        points = np.stack(np.meshgrid([x], axes[1], axes[2], indexing="ij"), axis=-1)
+        found = look_up_surfaces(model, points.reshape(-1, 3), None)
+        values[i] = found[0].reshape(values[i].shape)
+        step(i + 1, int(counts[0]))
+    within = (slice(1, -1),) * 3
+    cut = np.maximum(values, spacing)
+    cut[within] = values[within]
+    if not cut.min() < 0.0:
+        raise ValueError(
+            f"The field has no surface in the box: its signed value is at least {cut.min():.3g} "
+            "world units. Train longer, or give a larger --box."
+        )
+    return Grid(cut, low, spacing)
+
+
+def look_up_surfaces(
+    model: Model,
+    points: Float[np.ndarray, "n 3"],
+    directions: Float[np.ndarray, "n 3"] | None,
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Returns signed value in world units, unit normal, and sRGB colour along view directions.
+
+    Arguments are those of `look_up_points`.
+    """
+    seen = _in_chunks(model, points, directions, _surface_chunk)
+    return seen[0], seen[1], seen[2]
+
+
+def surface_box(
+    model: Model, half: float | None
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Returns the corners of the box in which a field has its surface, world units.
+
+    Args:
+      model: model whose field has a surface.
+      half: half-extent of the box, around the same centre; by default that of the field's ball.
+    """
+    ball = ball_of(model.config)
+    centre, half = np.array(ball.centre), ball.radius if half is None else half
+    return centre - half, centre + half
 
 
 def inside_objects(
@@ -232,8 +312,21 @@ def find_surface(density: Grid, *, level: float) -> DensitySurface:
       ValueError: if the density never has that level, or scikit-image is not installed.
     """
     thinness = _thinness(density, level)
-    vertices, faces = grids.march(thinness, density.spacing)
-    vertices = density.low + vertices
+    return _level_set(density._replace(values=thinness))
+
+
+def zero_surface(signed: Grid) -> DensitySurface:
+    """Returns the surface where a signed value is 0; see `sample_surface`.
+
+    Raises:
+      ValueError: if scikit-image is not installed.
+    """
+    return _level_set(signed)
+
+
+def _level_set(values: Grid) -> DensitySurface:
+    vertices, faces = grids.march(values.values, values.spacing)
+    vertices = values.low + vertices
     return DensitySurface(vertices, faces, unit_vectors(vertex_vectors(vertices, faces)))
 
 
@@ -243,7 +336,12 @@ def find_points(density: Grid, *, level: float) -> SurfacePoints:
     Raises:
       ValueError: if there is none.
     """
-    thinness = _thinness(density, level)
+    return outer_points(density._replace(values=_thinness(density, level)))
+
+
+def outer_points(signed: Grid) -> SurfacePoints:
+    """Returns the grid points where a value is at most 0 that have a neighbour where it is not."""
+    thinness = signed.values
     dense = thinness <= 0.0
     padded = np.pad(dense, 1, constant_values=True)  # beyond the grid nothing is known
     middle = (slice(1, -1),) * 3
@@ -253,7 +351,7 @@ def find_points(density: Grid, *, level: float) -> SurfacePoints:
             buried &= np.roll(padded, shift, axis)[middle]
     index = np.argwhere(dense & ~buried)
     slopes = np.stack([slope[tuple(index.T)] for slope in np.gradient(thinness)], axis=-1)
-    return SurfacePoints(density.low + density.spacing * index, unit_vectors(slopes))
+    return SurfacePoints(signed.low + signed.spacing * index, unit_vectors(slopes))
 
 
 def write_surface(path: Path, surface: DensitySurface, colours: UInt8[np.ndarray, "n 3"]) -> None:

@@ -9,7 +9,8 @@
 - `distance`: the median of the field's weights along a pixel's heaviest path (see
   `render.images.Rendering`), from 0 to a fixed length, so that colours mean the same in all views.
 - `normals`, `mask`: of the first surface of the meshes, without light. Normals point outwards and
-  are coloured `(n + 1) / 2` by world axes.
+  are coloured `(n + 1) / 2` by world axes. Along straight rays, a field with a surface shows its
+  normals at the distances of the pixels.
 - `error`: of one test view, amplified as in `comparison`, at its own pixels.
 
 Everything is drawn in bands of rows; drawing can be cancelled between two bands.
@@ -23,9 +24,11 @@ import jax
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from experiments.exporting import field_mesh
 from experiments.figures import comparison
 from refref_jax.data import image_files
 from refref_jax.data.scene_folder import Frames
+from refref_jax.fields import registry
 from refref_jax.geometry import cameras
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics.interface_rules import RULES, ambient_of
@@ -33,6 +36,7 @@ from refref_jax.optics.light_paths import Branch
 from refref_jax.optics.media import Interfaces
 from refref_jax.render import Model, images, render_image
 from refref_jax.render.images import NO_PART, find_first_surface
+from refref_jax.render.model import ball_of
 
 RGB, REFRACTION, REFLECTION = "rgb", "refraction only", "reflection only"
 DISTANCE, NORMALS, MASK, ERROR = "distance", "normals", "mask", "error"
@@ -70,8 +74,12 @@ def offered(model: Model, *, truth: bool) -> tuple[str, ...]:
       model: trained model of the scene.
       truth: whether there are test views.
     """
-    bent = (REFRACTION, REFLECTION, DISTANCE, NORMALS, MASK)
-    return (RGB, *(bent if model.settings.max_bends else (DISTANCE,)), *((ERROR,) if truth else ()))
+    layers: tuple[str, ...] = (DISTANCE,)
+    if model.settings.max_bends:
+        layers = (REFRACTION, REFLECTION, DISTANCE, NORMALS, MASK)
+    elif registry.has_surface(model.config.field):
+        layers = (DISTANCE, NORMALS)
+    return (RGB, *layers, *((ERROR,) if truth else ()))
 
 
 def draw(
@@ -91,15 +99,18 @@ def draw(
     Returns:
       The image, or `None` if it was cancelled.
     """
-    if layer in OF_SURFACES:
+    learned = layer == NORMALS and not model.settings.max_bends
+    if layer in OF_SURFACES and not learned:
         return None if cancelled() else _draw_surface(model, layer, rays, most)
     bands = []
     for band in _bands(rays):
         if cancelled():
             return None
         seen = render_image(model, band, chunk=chunk, branch=_BRANCHES.get(layer, "both"))
-        bands.append(seen.distance if layer == DISTANCE else seen.rgb)
+        bands.append(seen.distance if layer in (DISTANCE, NORMALS) else seen.rgb)
     whole = np.concatenate(bands)
+    if learned:
+        return _normals_at(model, rays, whole)
     if layer == DISTANCE:
         # From wall to wall: hardly anything inside a bounded scene is farther.
         return comparison.colour_distances([whole], farthest=2.0 * model.config.radius)[0]
@@ -173,6 +184,17 @@ def _draw_surface(model: Model, layer: str, rays: Rays, most: int) -> Image:
         return np.broadcast_to(np.where(found, 255, 0), (*shape, 3)).astype(np.uint8)
     normals = image_files.to_bytes(0.5 * (met.normals[:count].reshape(*shape, 3) + 1.0))
     return np.where(found, normals, np.uint8(_NOWHERE))
+
+
+def _normals_at(model: Model, rays: Rays, distance: Float[np.ndarray, "h w"]) -> Image:
+    """Returns the normals of a field's surface at distances along straight rays."""
+    ball = ball_of(model.config)
+    points = rays.origins + distance[..., None] * rays.directions
+    flat = (each.reshape(-1, 3) for each in (points, rays.directions))
+    _, normals, _ = field_mesh.look_up_surfaces(model, *flat)
+    found = np.linalg.norm(points - ball.centre, axis=-1, keepdims=True) < ball.radius
+    seen = image_files.to_bytes(0.5 * (normals.reshape(points.shape) + 1.0))
+    return np.where(found, seen, np.uint8(_NOWHERE))
 
 
 def _bands(rays: Rays) -> Iterator[Rays]:

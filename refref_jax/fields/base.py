@@ -1,9 +1,9 @@
 """Interface of field kinds: their configurations, functions and arithmetic precision.
 
 A radiance field has two functions, `init_radiance` and `radiance`, and a third, `blend`, if it has
-sub-spaces; a proposal field has `init_density` and `density`. All are pure functions, most of them
-over Gaussians in the unit cube. A field kind is one module with a `FieldKind`, and one line in
-`registry`, through which all other modules query fields.
+sub-spaces, or `depth`, if it has a surface; a proposal field has `init_density` and `density`. All
+are pure functions, most of them over Gaussians in the unit cube. A field kind is a `FieldKind` in a
+module, and one line in `registry`, through which all other modules query fields.
 
 The precision is float32, or mixed with bfloat16: tables are then read and matrices multiplied in
 bfloat16, while parameters, sums, gradients and outputs stay in float32. bfloat16 has only 8
@@ -20,8 +20,9 @@ from typing import Any, NamedTuple, get_args
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
+from refref_jax import numerics
 from refref_jax.choices import Footprint, Precision
 from refref_jax.sampling.polylines import Gaussians
 
@@ -117,6 +118,49 @@ class SubSpaces(NamedTuple):
     features: Float[Array, "sub_spaces channels"]
 
 
+class Surface(NamedTuple):
+    """Output of a radiance field with a surface: where its signed value is 0, inside a ball.
+
+    Beyond the ball, the field has a density. How much light an interval stops is decided by
+    `FieldKind.depth`, which knows its length. The unit of length is the radius of the ball.
+
+    Attributes:
+      signed: signed value, negative inside the surface, and near it about the distance to it.
+      slope: gradient of the signed value by position.
+      curvature: Laplacian of the signed value.
+      within: whether the middle of the interval is in the ball.
+      density: density per scene radius, non-negative, meaningless in the ball.
+      rgb: linear radiance towards the camera, in `[-0.001, 1.001]`.
+    """
+
+    signed: Float[Array, ""]
+    slope: Float[Array, "3"]
+    curvature: Float[Array, ""]
+    within: Bool[Array, ""]
+    density: Float[Array, ""]
+    rgb: Float[Array, "3"]
+
+
+class SurfaceSums(NamedTuple):
+    """Sums over the samples of a path that are in the ball of a field's surface.
+
+    Attributes:
+      eikonal: sum of `(|slope| - 1)^2`.
+      curvature: sum of the absolute curvatures.
+      samples: number of the samples.
+      share: share of the path's light that comes from them.
+    """
+
+    eikonal: Float[Array, "*paths"]
+    curvature: Float[Array, "*paths"]
+    samples: Float[Array, "*paths"]
+    share: Float[Array, "*paths"]
+
+
+Seen = Radiance | SubSpaces | Surface
+"""Output of a radiance field for one interval."""
+
+
 class Blend(NamedTuple):
     """Colours of the sub-spaces along one path, and their shares.
 
@@ -160,7 +204,7 @@ class FieldKind(NamedTuple):
       init_radiance: function of key and shape that returns initial radiance field parameters.
       radiance: function of parameters, shape, Gaussians in the unit cube (fractions of its edge)
         and unit direction of travel (world frame) that returns density and colour of one interval,
-        or density and features of its sub-spaces.
+        or density and features of its sub-spaces, or the signed value of its surface.
       density_config: configuration class of the proposal fields.
       init_density: function of key and shape that returns initial proposal field parameters.
       density: function of parameters, shape and Gaussians that returns the density of one interval.
@@ -168,22 +212,43 @@ class FieldKind(NamedTuple):
       hash_decay: weight of the hash decay loss.
       blend: function of parameters, shape and the features of each sub-space, integrated along the
         path, that returns their colours and shares; `None` if the field has a colour at each point.
+      depth: function of parameters, shape, what `radiance` returned for an interval, direction of
+        travel, length of the interval in scene radii and progress of the training, 0 to 1, that
+        returns the interval's optical depth; `None` if that is density times length.
+      eikonal: weight of the eikonal loss of a surface; `None` if there is none.
+      curvature: weight of the curvature loss of a surface.
     """
 
     radiance_config: type[RadianceConfig]
     init_radiance: Callable[[Array, Any], Params]
-    radiance: Callable[[Params, Any, Gaussians, Float[Array, "3"]], Radiance | SubSpaces]
+    radiance: Callable[[Params, Any, Gaussians, Float[Array, "3"]], Seen]
     density_config: type[DensityConfig]
     init_density: Callable[[Array, Any], Params]
     density: Callable[[Params, Any, Gaussians], Float[Array, ""]]
     sizes: Mapping[str, FieldSize]
     hash_decay: float
     blend: Callable[[Params, Any, Float[Array, "sub_spaces channels"]], Blend] | None = None
+    depth: Callable[[Params, Any, Surface, Array, Array, Array], Float[Array, ""]] | None = None
+    eikonal: float | None = None
+    curvature: float | None = None
+
+
+def sums(seen: Surface, weights: Float[Array, " samples"]) -> SurfaceSums:
+    """Returns the sums over the samples of a path, whose values `seen` stacks."""
+    stretch = jnp.square(numerics.length(seen.slope) - 1.0)
+    values = stretch, jnp.abs(seen.curvature), jnp.ones_like(weights), weights
+    return SurfaceSums(*(jnp.sum(jnp.where(seen.within, each, 0.0)) for each in values))
 
 
 def evaluate(module: nn.Module, params: Params, *inputs: Any) -> Any:
     """Returns the output of a Flax module alone; its `apply` may return variables as well."""
     return module.apply(params, *inputs)
+
+
+def shape_of(config: FieldConfig) -> dict[str, Any]:
+    """Returns the values of a configuration without its kind, for a field of another kind."""
+    names = [each.name for each in dataclasses.fields(config) if each.name != "kind"]
+    return {name: getattr(config, name) for name in names}
 
 
 def in_half_precision(size: FieldSize) -> FieldSize:

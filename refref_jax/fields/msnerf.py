@@ -18,7 +18,7 @@ and the size `paper`. The other sizes are ours.
 """
 
 import dataclasses
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -28,13 +28,13 @@ from jaxtyping import Array, Float
 from refref_jax.fields import zipnerf
 from refref_jax.fields.base import (
     Blend,
-    FieldConfig,
     FieldKind,
     FieldSize,
     Params,
     SubSpaces,
     dense,
     evaluate,
+    shape_of,
 )
 from refref_jax.fields.hash_grid import (
     GridDensityConfig,
@@ -168,19 +168,14 @@ def _size(name: str, *, sub_spaces: int, channels: int, decoder_width: int) -> F
     """Returns the size of Zip-NeRF's fields of that name, with sub-spaces."""
     size = zipnerf.KIND.sizes[name]
     field = MsnerfConfig(
-        **_shape(size.field),
+        **shape_of(size.field),
         sub_spaces=sub_spaces,
         channels=channels,
         decoder_width=decoder_width,
     )
-    proposals = tuple(MsnerfProposalConfig(**_shape(each)) for each in size.proposals)
+    proposals = tuple(MsnerfProposalConfig(**shape_of(each)) for each in size.proposals)
     # Fewer samples before walls were not tried.
     return size._replace(field=field, proposals=proposals, background_samples=None)
-
-
-def _shape(config: FieldConfig) -> dict[str, Any]:
-    names = [each.name for each in dataclasses.fields(config) if each.name != "kind"]
-    return {name: getattr(config, name) for name in names}
 
 
 KIND = FieldKind(

@@ -8,16 +8,16 @@ from collections.abc import Mapping
 
 from jaxtyping import Array, Float
 
-from refref_jax.fields import msnerf, nerfacto, zipnerf
+from refref_jax.fields import msnerf, nerfacto, neus, zipnerf
 from refref_jax.fields.base import (
     Blend,
     DensityConfig,
     FieldConfig,
     FieldKind,
     Params,
-    Radiance,
     RadianceConfig,
-    SubSpaces,
+    Seen,
+    Surface,
 )
 from refref_jax.sampling.polylines import Gaussians
 
@@ -25,6 +25,8 @@ KINDS: dict[str, FieldKind] = {
     "zipnerf": zipnerf.KIND,
     "nerfacto": nerfacto.KIND,
     "msnerf": msnerf.KIND,
+    "neus": neus.KIND,
+    "unisurf": neus.UNISURF,
 }
 
 USUAL = "zipnerf"
@@ -38,8 +40,8 @@ def init_radiance(key: Array, config: RadianceConfig) -> Params:
 
 def radiance(
     params: Params, config: RadianceConfig, gaussians: Gaussians, direction: Float[Array, "3"]
-) -> Radiance | SubSpaces:
-    """Returns density and colour, or sub-spaces, of one interval of a path; see `FieldKind`."""
+) -> Seen:
+    """Returns what a field has in one interval of a path; see `FieldKind`."""
     return KINDS[config.kind].radiance(params, config, gaussians, direction)
 
 
@@ -52,9 +54,28 @@ def blend(
     return blended(params, config, features)
 
 
+def depth(
+    params: Params,
+    config: RadianceConfig,
+    seen: Surface,
+    direction: Float[Array, "3"],
+    length: Float[Array, ""],
+    progress: Float[Array, ""],
+) -> Float[Array, ""]:
+    """Returns the optical depth of one interval of a path; see `FieldKind`."""
+    law = KINDS[config.kind].depth
+    assert law is not None, config.kind
+    return law(params, config, seen, direction, length, progress)
+
+
 def has_sub_spaces(config: RadianceConfig) -> bool:
     """Returns whether a field has sub-spaces, so that only whole paths have a colour."""
     return KINDS[config.kind].blend is not None
+
+
+def has_surface(config: RadianceConfig) -> bool:
+    """Returns whether a field has a surface, so that opacity depends on the path."""
+    return KINDS[config.kind].depth is not None
 
 
 def init_density(key: Array, config: DensityConfig) -> Params:

@@ -21,8 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax import compilation
 from refref_jax.geometry import bvh_nodes, traversal
-from refref_jax.geometry import triangles as prepared
-from refref_jax.geometry.rays import Rays
+from refref_jax.geometry.rays import Rays, facet_barycentric
 from refref_jax.geometry.traversal import PACKET, Packet
 
 LEAF_SIZE = bvh_nodes.LEAF_SIZE
@@ -38,7 +37,7 @@ class BVH(NamedTuple):
     Attributes:
       nodes: one node table for each octant of directions (see `bvh_nodes`).
       triangles: corners of each primitive, in leaf order, then `LEAF_SIZE` that are never hit.
-      facets: the same triangles, precomputed for the intersection test (see `triangles`).
+      facets: the same triangles, precomputed for the intersection test (see `rays`).
     """
 
     nodes: Int[Array, "8 nodes 8"]
@@ -129,7 +128,7 @@ def _finish(
     hit = jnp.isfinite(distances) & (primitive_ids != bvh_nodes.NONE)
     found = jnp.where(hit, primitive_ids, 0)
     met = bvh.facets.at[found].get(mode="promise_in_bounds")
-    barycentrics = jax.vmap(prepared.barycentric)(origins, directions, met)
+    barycentrics = jax.vmap(facet_barycentric)(origins, directions, met)
     return Hits(
         jnp.where(hit, distances, jnp.inf),
         jnp.where(hit, primitive_ids, NO_PRIMITIVE),

@@ -232,7 +232,7 @@ def pack_nodes(
 
 
 def prepare_facets(triangles: Float[np.ndarray, "faces 3 3"]) -> Float[np.ndarray, "faces 12"]:
-    """Precomputes triangles for `triangles.distance`, in the precision of the input."""
+    """Precomputes triangles for `rays.facet_distance`, in the precision of the input."""
     a, b, c = np.moveaxis(triangles.astype(np.float64), 1, 0)
     normal = np.cross(b - a, c - a)
     return np.concatenate([a, b - a, a - c, normal], axis=-1).astype(triangles.dtype)

@@ -14,8 +14,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from refref_jax import numerics
-from refref_jax.geometry import bvh_build, triangles
+from refref_jax.geometry import bvh_build
 from refref_jax.geometry.bvh import BVH
+from refref_jax.geometry.rays import geometric_normal, interpolate
 from refref_jax.geometry.triangle_meshes import Mesh
 
 
@@ -71,15 +72,15 @@ def surface_point(
       barycentric: weights of the second and third corner.
     """
     corners = surfaces.bvh.triangles[primitive_id]
-    geometric = triangles.geometric_normal(corners)
-    blended = triangles.interpolate(surfaces.normals[primitive_id], barycentric)
+    geometric = geometric_normal(corners)
+    blended = interpolate(surfaces.normals[primitive_id], barycentric)
     shading = numerics.normalize(blended)
     opposed = numerics.dot(shading, geometric) <= 0.0
     radiance = None
     if surfaces.radiance.shape[0]:
-        radiance = triangles.interpolate(surfaces.radiance[primitive_id], barycentric)
+        radiance = interpolate(surfaces.radiance[primitive_id], barycentric)
     return SurfacePoint(
-        position=triangles.interpolate(corners, barycentric),
+        position=interpolate(corners, barycentric),
         geometric_normal=geometric,
         shading_normal=jnp.where(opposed, geometric, shading),
         part=surfaces.parts[primitive_id],

@@ -4,7 +4,7 @@ As an option, a kernel of NVIDIA Warp traces single rays, each in a thread of it
 
 The rays of a packet share one node index, and the packet descends where any of its rays hits. Rays
 are stored component by component, so that XLA turns each operation of the single-ray functions in
-`bvh_nodes` and `triangles` into one vector instruction. Packets are traced one after the other; the
+`bvh_nodes` and `rays` into one vector instruction. Packets are traced one after the other; the
 cost of a packet without active rays is negligible.
 
 A packet uses the node table of its rays' octant. If its rays have several octants, it traverses
@@ -17,9 +17,8 @@ the few leaves that it met at its end. A read from a computed row costs most of 
 one reads the following rows, too, which are the likely next nodes.
 
 The kernel (`trace_in_warp`) is `trace_ray` again, over the same tables and with the same rules of
-edges, ties and of the triangle that a ray leaves: a change of one is a change of both. It is
-compiled without fused multiply-adds, so that its distances are the bits of the formulas in
-`triangles`, computed operation by operation.
+edges, ties and of the triangle that a ray leaves: a change of one is a change of both. Without
+fused multiply-adds, its distances are the bits of the formulas in `rays`, operation by operation.
 
 Source: Wald et al., Interactive Rendering with Coherent Ray Tracing (2001), for packets; Smits,
 Efficiency Issues for Ray Tracing (1998), for skip pointers.
@@ -33,7 +32,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float, Int
 
 from refref_jax.compilation import native_loop
-from refref_jax.geometry import bvh_nodes, triangles
+from refref_jax.geometry import bvh_nodes
+from refref_jax.geometry.rays import EDGE_TOLERANCE, facet_distance
 
 PACKET = 16
 """Number of rays in a packet: two vectors of eight, which hide each other's latency."""
@@ -205,7 +205,7 @@ def _test_leaf(
     def meet(offset: int) -> Closest:
         primitive_id = first + offset
         facet = bvh_nodes.read_row(packed, primitive_id)
-        distances = jax.vmap(triangles.distance, in_axes=(-1, -1, None))(
+        distances = jax.vmap(facet_distance, in_axes=(-1, -1, None))(
             packet.origins, packet.directions, facet
         )
         return Closest(
@@ -347,7 +347,7 @@ def _test_leaf_of_ray(
     for offset in range(bvh_nodes.LEAF_SIZE):
         candidate = jnp.maximum(leaf - 1, 0) + offset
         facet = bvh_nodes.read_row(packed, candidate)
-        found = triangles.distance(ray.origin, ray.direction, facet)
+        found = facet_distance(ray.origin, ray.direction, facet)
         closer = (found < distance) | ((found == distance) & (candidate < primitive_id))
         closer = closer & (candidate != ray.exclude_primitive) & (leaf > 0)
         distance = jnp.where(closer, found, distance)
@@ -475,10 +475,10 @@ def _warp_overlaps() -> Any:
 
 @no_type_check
 def _warp_distance() -> Any:
-    """Returns `triangles.distance` in Warp; a facet is three rows of four numbers."""
+    """Returns `rays.facet_distance` in Warp; a facet is three rows of four numbers."""
     import warp as wp
 
-    edge_tolerance = triangles.EDGE_TOLERANCE
+    edge_tolerance = EDGE_TOLERANCE
 
     @wp.func
     def distance(

@@ -16,9 +16,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax import numerics
-from refref_jax.geometry import surfaces, triangles
+from refref_jax.geometry import surfaces
 from refref_jax.geometry.bvh import NO_PRIMITIVE
-from refref_jax.geometry.rays import Rays
+from refref_jax.geometry.rays import Rays, intersect
 from refref_jax.geometry.surfaces import SurfacePoint
 from refref_jax.optics import fresnel, media, microfacet, ray_differentials
 from refref_jax.optics.light_paths import PathStatus, Stop
@@ -304,7 +304,7 @@ def arrive(scene: Scene, state: RayState, primitive_id: Int[Array, ""]) -> Arriv
         origin: Float[Array, "3"], direction: Float[Array, "3"], tilt: Float[Array, "2"] | None
     ) -> tuple[Bend, Interaction]:
         corners = scene.surfaces.bvh.triangles[primitive_id]
-        found = triangles.intersect(origin, direction, corners).barycentric
+        found = intersect(origin, direction, corners).barycentric
         # A ray without a hit reads an arbitrary triangle: keep it out of values and gradients.
         barycentric = jnp.where(primitive_id == NO_PRIMITIVE, 1.0 / 3.0, found)
         point = surfaces.surface_point(scene.surfaces, primitive_id, barycentric)

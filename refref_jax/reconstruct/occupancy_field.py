@@ -35,6 +35,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from refref_jax import numerics
+from refref_jax.fields import hash_grid
 from refref_jax.fields.base import evaluate
 from refref_jax.fields.hash_grid import HashGrid, HashGridConfig
 
@@ -43,9 +44,6 @@ Params = Any
 
 # The finest level is a dense grid: every vertex has an entry of its own.
 _GRID = HashGridConfig(levels=4, base_res=8, max_res=64, hashmap_size=1 << 19, features=2)
-
-# Corners of a regular tetrahedron, whose outer products sum to 4 times the identity.
-_TETRAHEDRON = ((1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,11 +90,7 @@ def signed(
 def slope(
     params: Params, config: OccupancyFieldConfig, position: Float[Array, "3"], *, step: float
 ) -> Float[Array, "3"]:
-    """Returns the gradient of `f`, outward, by finite differences on a tetrahedron.
-
-    Finite differences span the boundaries of the grid's cells, where the derivative jumps, and can
-    be differentiated with respect to the parameters at the cost of four values. The error is about
-    the step times the second derivative.
+    """Returns the gradient of `f`, outward, by finite differences (`hash_grid.slope`).
 
     Args:
       params: parameters of the field, from `init`.
@@ -104,9 +98,9 @@ def slope(
       position: point of the unit cube.
       step: offset of each coordinate, in edges of the cube; about a cell of the finest level.
     """
-    corners = jnp.asarray(_TETRAHEDRON)
+    corners = jnp.asarray(hash_grid.TETRAHEDRON)
     values = jax.vmap(functools.partial(signed, params, config))(position[None] + step * corners)
-    return numerics.product(values, corners) / (4.0 * step)
+    return hash_grid.slope(values, step=step)
 
 
 class _OccupancyField(nn.Module):

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from refref_jax import numerics
 from refref_jax.choices import (
     ORIGIN,
     Footprint,
@@ -25,7 +26,8 @@ from refref_jax.choices import (
     ViewDependence,
 )
 from refref_jax.fields import base, registry
-from refref_jax.fields.base import DensityConfig, Radiance, RadianceConfig
+from refref_jax.fields.base import DensityConfig, Radiance, RadianceConfig, Surface
+from refref_jax.fields.neus import SurfaceConfig
 from refref_jax.optics.path_settings import Detail, PathSettings, Tally
 from refref_jax.optics.scene import Scene
 from refref_jax.render import backdrop, learned_media
@@ -282,7 +284,8 @@ def look_up(
       width: edge of the cell around the point, world units: finer detail is blurred.
 
     Raises:
-      ValueError: if the model has a backdrop instead of fields, or its field has sub-spaces.
+      ValueError: if the model has a backdrop instead of fields, or its field has sub-spaces or a
+        surface.
     """
     if config.backdrop is not None:
         raise ValueError(
@@ -294,6 +297,11 @@ def look_up(
             f"A point has no colour in fields of kind {config.field.kind}, which blends sub-spaces "
             "along whole paths. Train with field=zipnerf."
         )
+    if registry.has_surface(config.field):
+        raise ValueError(
+            f"A point has no density in fields of kind {config.field.kind}, whose opacity depends "
+            "on the way through it. Use look_up_surface, or train with field=zipnerf."
+        )
     # Standard deviation of a cube along each axis.
     scale = jnp.full((1,), width, point.dtype) / jnp.sqrt(jnp.asarray(12.0, point.dtype))
     bounds = config.domain
@@ -302,3 +310,67 @@ def look_up(
     seen = registry.radiance(params.field, config.field, cell, direction)
     assert isinstance(seen, Radiance)
     return FieldPoint(seen.density / config.radius, seen.rgb)
+
+
+class SurfaceValue(NamedTuple):
+    """Values of a field with a surface at a point.
+
+    Attributes:
+      distance: signed value, world units: 0 on the surface, negative inside it, and near it about
+        the distance to it.
+      normal: unit normal of its level set, outward.
+      linear: linear RGB radiance, opposite to the direction of travel.
+    """
+
+    distance: Float[Array, ""]
+    normal: Float[Array, "3"]
+    linear: Float[Array, "3"]
+
+
+def look_up_surface(
+    params: Params, config: ModelConfig, point: Float[Array, "3"], direction: Float[Array, "3"]
+) -> SurfaceValue:
+    """Returns signed value, normal and colour at one point; map it over many.
+
+    Args:
+      params: parameters of the model.
+      config: configuration of the model, whose field has a surface (`registry.has_surface`).
+      point: position in world units; beyond the ball of the surface, its value is at least the
+        distance to the ball.
+      direction: unit direction of travel of the viewing path.
+
+    Raises:
+      ValueError: if the field has no surface.
+    """
+    if config.backdrop is not None or not isinstance(config.field, SurfaceConfig):
+        raise ValueError(
+            f"Fields of kind {config.field.kind} have no surface. Use look_up, or train with "
+            "field=neus."
+        )
+    ball = ball_of(config)
+    offset = point - jnp.asarray(ball.centre, point.dtype)
+    cell = scene_bounds.to_unit_cube(config.domain, Gaussians(point[None], jnp.zeros(1)))
+    seen = registry.radiance(params.field, config.field, cell, direction)
+    assert isinstance(seen, Surface)
+    distance = jnp.maximum(ball.radius * seen.signed, numerics.length(offset) - ball.radius)
+    return SurfaceValue(distance, numerics.normalize(seen.slope), seen.rgb)
+
+
+class Ball(NamedTuple):
+    """A ball in world units.
+
+    Attributes:
+      centre: its centre.
+      radius: its radius.
+    """
+
+    centre: Position
+    radius: float
+
+
+def ball_of(config: ModelConfig) -> Ball:
+    """Returns the ball in which a field has its surface."""
+    assert isinstance(config.field, SurfaceConfig)
+    edge, middle = 2.0 * config.radius, zip(config.centre, config.field.ball_centre, strict=True)
+    x, y, z = (centre + edge * (share - 0.5) for centre, share in middle)
+    return Ball((x, y, z), edge * config.field.ball_radius)

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from refref_jax.fields import registry
+from refref_jax.fields.base import Radiance
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import path_tracing
 from refref_jax.optics.light_paths import LightPaths, PathStatus
@@ -34,15 +35,16 @@ def render_ray(model: Model, ray: Rays) -> Float[Array, "3"]:
       ray: one camera ray, without leading axes.
 
     Raises:
-      ValueError: if the model has a backdrop instead of fields, or its field has sub-spaces.
+      ValueError: if the model has a backdrop instead of fields, or its field has sub-spaces or
+        a surface.
     """
     config, params = model.config, model.params
     if config.backdrop is not None:
         raise ValueError("This page shows fields, but the model has a backdrop. Use render_rays.")
-    if registry.has_sub_spaces(config.field):
+    if registry.has_sub_spaces(config.field) or registry.has_surface(config.field):
         raise ValueError(
-            f"This page shows fields with one colour at a point, but the field is of kind "
-            f"{config.field.kind}. Use render_rays."
+            f"This page shows fields with density and one colour at a point, but the field is of "
+            f"kind {config.field.kind}. Use render_rays."
         )
     density = jax.vmap(registry.density, in_axes=(None, None, 0))
     radiance = jax.vmap(registry.radiance, in_axes=(None, None, 0, 0))
@@ -66,7 +68,9 @@ def render_ray(model: Model, ray: Rays) -> Float[Array, "3"]:
 
         # Query: density and colour of the multisamples, seen along the local direction.
         s, t, x, points = draw(histograms, config.samples)
-        sigma, c = radiance(params.field, config.field, x, points.direction)
+        seen = radiance(params.field, config.field, x, points.direction)
+        assert isinstance(seen, Radiance)
+        sigma, c = seen
 
         # Composite: the volume rendering integral along the path.
         w = _weights(sigma, jnp.diff(t) / config.radius)

@@ -79,9 +79,13 @@ def gather_light(
     *,
     rays: int,
     anneal: Float[Array, ""],
+    progress: Float[Array, ""] | None = None,
 ) -> Light:
-    """Sums the contributions of paths to their rays; arguments as in `render_pixels`."""
-    seen = render_paths(params, config, paths, jitter, anneal=anneal)
+    """Sums the contributions of paths to their rays.
+
+    Arguments are those of `render_pixels`, and the progress of `volume_rendering.path_radiance`.
+    """
+    seen = render_paths(params, config, paths, jitter, anneal=anneal, progress=progress)
     paths = learned_media.attenuate(params.tints, paths, radius=config.radius)
     linear = jax.ops.segment_sum(
         paths.throughput * seen.composite.rgb, paths.rays, num_segments=rays
@@ -96,8 +100,9 @@ def render_paths(
     jitter: Jitter,
     *,
     anneal: Float[Array, ""],
+    progress: Float[Array, ""] | None = None,
 ) -> PathRadiance:
-    """Renders each path of a batch independently."""
+    """Renders each path of a batch independently; arguments as in `path_radiance`."""
     if config.backdrop is not None:
         seen = _see_backdrop(params, config, paths)
         if not has_foreground(config):
@@ -106,8 +111,8 @@ def render_paths(
         front = render(params, config, paths, jitter, anneal)
         behind = jax.vmap(volume_rendering.in_front_of)(front.composite, seen.rgb, seen.mean)
         return front._replace(composite=behind)
-    render = jax.vmap(volume_rendering.path_radiance, in_axes=(None, None, 0, 0, None))
-    return render(params, config, paths, jitter, anneal)
+    one = functools.partial(volume_rendering.path_radiance, progress=progress)
+    return jax.vmap(one, in_axes=(None, None, 0, 0, None))(params, config, paths, jitter, anneal)
 
 
 def _see_backdrop(params: Params, config: ModelConfig, paths: LightPaths) -> Composite:

@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float
 from refref_jax import numerics
 from refref_jax.choices import LastSample
 from refref_jax.fields import base, registry
-from refref_jax.fields.base import Radiance, SubSpaces
+from refref_jax.fields.base import Radiance, Seen, SubSpaces, Surface, SurfaceSums
 from refref_jax.optics.light_paths import LightPaths
 from refref_jax.render.model import Layers, ModelConfig, Params
 from refref_jax.sampling import polylines, scene_bounds, stepfun
@@ -67,7 +67,11 @@ def alpha_weights(
 
     Source: paper, volume rendering equation.
     """
-    depth = density * jnp.where(lengths < 0.0, 0.0, lengths)
+    return depth_weights(density * jnp.where(lengths < 0.0, 0.0, lengths))
+
+
+def depth_weights(depth: Float[Array, " samples"]) -> Float[Array, " samples"]:
+    """Returns the weights of intervals with the optical depths `sigma_i delta_i`."""
     before = jnp.concatenate([jnp.zeros_like(depth[:1]), jnp.cumsum(depth[:-1])])
     return jnp.exp(-before) * -jnp.expm1(-depth)
 
@@ -144,11 +148,13 @@ class PathRadiance(NamedTuple):
       composite: colour and distances; distances are arc length from the camera.
       histograms: histogram of each proposal level, then of the radiance field.
       outside: whether each of the final intervals is outside the objects (by its middle).
+      surface: sums for the losses of a surface, if the field has one.
     """
 
     composite: Composite
     histograms: tuple[Histogram, ...]
     outside: Bool[Array, " samples"]
+    surface: SurfaceSums | None = None
 
 
 class Samples(NamedTuple):
@@ -174,6 +180,8 @@ def path_radiance(
     path: LightPaths,
     jitter: Jitter,
     anneal: Float[Array, ""],
+    *,
+    progress: Float[Array, ""] | None = None,
 ) -> PathRadiance:
     """Renders one light path.
 
@@ -184,16 +192,22 @@ def path_radiance(
       jitter: jitter of the path.
       anneal: exponent on the proposals' weights, from 0 for uniform sampling to 1 for the
         proposals' distribution.
+      progress: progress of the training, 0 to 1, on which the opacity of a surface may depend; its
+        end by default.
     """
     line = polyline(config, path)
     warp = distance_warp(config, line)
     samples, seen, histograms = _sampled(params, config, line, warp, jitter, anneal)
-    weigh = functools.partial(_weigh, config, edges=samples.t)
-    weights, composited = integrate(params, config, seen, samples.t, weigh=weigh)
+    if isinstance(seen, Surface):
+        weights, composited = _integrate_surface(params, config, seen, samples, progress)
+    else:
+        weigh = functools.partial(_weigh, config, edges=samples.t)
+        weights, composited = integrate(params, config, seen, samples.t, weigh=weigh)
     return PathRadiance(
         composite=_in_arc_length(line, composited),
         histograms=(*histograms, Histogram(samples.s, weights)),
         outside=samples.points.outside,
+        surface=base.sums(seen, weights) if isinstance(seen, Surface) else None,
     )
 
 
@@ -220,6 +234,7 @@ def foreground_radiance(
         far = jnp.maximum(length, _SHORTEST * config.radius)
         warp = scene_bounds.DistanceWarp(0.0, far, config.radius)
         samples, seen, proposed = _sampled(params, config, line, warp, jitter, anneal)
+        assert not isinstance(seen, Surface)  # `resolve` refuses a backdrop behind a surface
 
         def weigh(density: Array) -> Array:
             return jnp.where(length > 0.0, _weigh(config, density, samples.t), 0.0)
@@ -271,6 +286,23 @@ def integrate(
     return weights, composited._replace(rgb=rgb)
 
 
+def _integrate_surface(
+    params: Params,
+    config: ModelConfig,
+    seen: Surface,
+    samples: Samples,
+    progress: Float[Array, ""] | None,
+) -> tuple[Float[Array, " samples"], Composite]:
+    """Returns the same as `integrate`, of a field with a surface, by the field's optical depths."""
+    lengths = jnp.maximum(jnp.diff(samples.t), 0.0) / config.radius
+    progress = jnp.ones_like(lengths[0]) if progress is None else progress
+    depth = jax.vmap(registry.depth, in_axes=(None, None, 0, 0, 0, None))(
+        _field_of(params), config.field, seen, samples.points.direction, lengths, progress
+    )
+    weights = opaque_end(depth_weights(depth))
+    return weights, composite(weights, seen.rgb, samples.t, last_sample=_last_sample(config))
+
+
 def in_front_of(front: Composite, rgb: Float[Array, "3"], distance: Float[Array, ""]) -> Composite:
     """Returns the colour and distance of a path that ends on an opaque surface.
 
@@ -297,7 +329,7 @@ def _opaque_surface(params: Params, config: ModelConfig, whole: Polyline) -> Flo
     cell = scene_bounds.to_unit_cube(config.domain, cone)
     direction = polylines.point_at(whole, at).direction
     seen = registry.radiance(_field_of(params), config.field, cell, direction)
-    if isinstance(seen, Radiance):
+    if not isinstance(seen, SubSpaces):
         return seen.rgb
     blend = registry.blend(_field_of(params), config.field, seen.features)
     return jnp.sum(blend.shares[:, None] * blend.rgb, axis=0)
@@ -314,7 +346,7 @@ def _sampled(
     warp: scene_bounds.DistanceWarp,
     jitter: Jitter,
     anneal: Float[Array, ""],
-) -> tuple[Samples, Radiance | SubSpaces, list[Histogram]]:
+) -> tuple[Samples, Seen, list[Histogram]]:
     """Returns the final samples, what the field returns there, and the proposals' histograms."""
 
     def drawn(level: int, count: int) -> Samples:

@@ -6,9 +6,8 @@ Every value is accessed by the name of its option. `None` leaves a decision to t
 preset: `training.resolve` takes it, with a reason, and returns the same tree without `None`. A run
 stores this resolved tree as `config.json`; a file in this form, complete or partial, can start
 another run. `TrainConfig.chosen` distinguishes overrides, which the user set, from decisions: with
-another scene, for example, decisions are taken again, and overrides are kept.
-
-This module imports neither JAX nor the library's numerics.
+another scene, for example, decisions are taken again, and overrides are kept. This module imports
+neither JAX nor the library's numerics.
 """
 
 import dataclasses
@@ -30,7 +29,7 @@ FIELD_ONLY = (
     *("log2_hashmap_size", "max_res", "precision", "colour_network", "contraction", "near", "far"),
     *("data_loss", "interlevel_weight", "blurs", "distortion_weight", "hash_decay", "distortion"),
     *("path_losses", "steps", "warmup", "learning_rate", "final_learning_rate", "anneal", "batch"),
-    *("pretraced_batches", "adam_b2", "sub_spaces"),
+    *("pretraced_batches", "adam_b2", "sub_spaces", "eikonal_weight", "curvature_weight"),
 )
 """Options that only a radiance field reads."""
 
@@ -54,12 +53,10 @@ _SAMPLES = (*_BOUNDS, *_OBJECTS, "centre", "paths", "max_bends", "interior", "fa
 
 # Maximum number of steps, rays and batches, which are 32-bit integers.
 _MOST = 2**31 - 1
-
 _FINEST, _CELLS, _SEEDS, _MOST_SUB_SPACES = 2**20, 2**13, 2**32, 64
 
 # Numbers of multisamples of the patterns in `sampling.polylines`.
 _PATTERNS = (1, 6)
-
 # A 32-bit hash cannot address more entries.
 _MOST_ENTRIES = 31
 
@@ -157,7 +154,8 @@ class FieldConfig:
 
     Attributes:
       preset: Size of the model and length of its training.
-      field: Field kind: zipnerf; nerfacto, without anti-aliasing; or msnerf, with sub-spaces.
+      field: Field kind: zipnerf; nerfacto, without anti-aliasing; msnerf, with sub-spaces; or
+        neus or unisurf, with the surface of an opaque object.
       sub_spaces: Number of sub-spaces, only of field=msnerf.
       interior: Model of the inside of the objects: a learned field (the paper), empty (clear), or
         interfaces and media that absorb light (absorbing). By default clear if all objects are
@@ -243,11 +241,10 @@ class FieldConfig:
             number = getattr(self, name)
             if number is not None and not least <= number <= most:
                 raise ValueError(f"{name} is {number}. Give {least} to {most}.")
-        if self.dilation is not None and not 0.0 <= self.dilation < math.inf:
-            raise ValueError(f"dilation is {self.dilation}. Give 0 or a positive number.")
-        for name, distance in (("near", self.near), ("far", self.far)):
-            if distance is not None and not 0.0 <= distance < math.inf:
-                raise ValueError(f"{name} is {distance}. Give 0 or a positive number.")
+        for name in ("dilation", "near", "far"):
+            number = getattr(self, name)
+            if number is not None and not 0.0 <= number < math.inf:
+                raise ValueError(f"{name} is {number}. Give 0 or a positive number.")
         size = self.log2_hashmap_size
         if size is not None and not 1 <= size <= _MOST_ENTRIES:
             raise ValueError(
@@ -271,6 +268,8 @@ class LossConfig:
         correction), or all (everywhere; Mip-NeRF 360, the paper's ablation).
       path_losses: Light paths in the interlevel and distortion losses: all, or all but those that
         are reflected at the first surface (transmitted; the paper's released code).
+      eikonal: Weight of the eikonal loss of a surface; by default the one of the field kind.
+      curvature: Weight of the curvature loss of a surface; by default the one of the field kind.
     """
 
     data: choices.DataLoss = option("mse", name="data_loss")
@@ -281,12 +280,14 @@ class LossConfig:
     tint_decay: float = option(1e-3, formerly="dye_decay")
     distortion_over: choices.DistortionOver = option("outside", name="distortion")
     path_losses: choices.PathLosses = option("all")
+    eikonal: float | None = option(None, name="eikonal_weight", after=("field",))
+    curvature: float | None = option(None, name="curvature_weight", after=("field",))
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
         configuration.convert_fields(self)
         weights = (self.interlevel, self.distortion, self.hash_decay, self.tint_decay)
-        for number in (*weights, *(self.blurs or ())):
+        for number in (*weights, self.eikonal, self.curvature, *(self.blurs or ())):
             if number is not None and not 0.0 <= number < math.inf:
                 raise ValueError(
                     f"A weight or blur of the losses is {number}. Give 0 or a positive number."
@@ -449,11 +450,10 @@ class TrainConfig:
         return getattr(section, option.field.name)
 
     def _with(self, option: Option, value: Any) -> "TrainConfig":
-        if not option.section:
-            return dataclasses.replace(self, **{option.field.name: value})
-        section = getattr(self, option.section)
-        section = dataclasses.replace(section, **{option.field.name: value})
-        return dataclasses.replace(self, **{option.section: section})
+        new, section = {option.field.name: value}, option.section
+        if section:
+            new = {section: dataclasses.replace(getattr(self, section), **new)}
+        return dataclasses.replace(self, **new)
 
 
 def require(value: _Value | None) -> _Value:

@@ -377,7 +377,8 @@ def _line(step: int, measured: StepReport, rate: float, seconds: float) -> dict[
             "finite, or train again with another seed in another folder; and please report the "
             "scene."
         )
-    values = {name: float(value) for name, value in measured._asdict().items()}
+    known = measured._asdict().items()
+    values = {name: float(value) for name, value in known if value is not None}
     line = {"step": step, **values, "rays_per_second": rate, "seconds": seconds}
     # CPUs do not report memory.
     if (memory := jax.local_devices()[0].memory_stats()) is not None:

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float, Int, UInt8
 
 from refref_jax.compilation import runs_on_cpu
 from refref_jax.data.batches import PixelSampler
+from refref_jax.fields import registry
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import light_paths, path_tracing
 from refref_jax.optics.path_settings import Detail, PathSettings, capacity_for
@@ -238,16 +239,24 @@ def _step(
     key = jax.random.fold_in(jax.random.key(config.seed), state.step)
     jitter = pixels.random_jitter(key, model, _slots(traced.paths.radii.shape[0], axis))
     anneal = _anneal(state.step, require(config.schedule.anneal))
+    progress = _progress(state.step, config, model)
 
     def sum_paths(params: Params) -> Totals:
         light = pixels.gather_light(
-            params, model, traced.paths, jitter, rays=rgb.shape[0], anneal=anneal
+            params,
+            model,
+            traced.paths,
+            jitter,
+            rays=rgb.shape[0],
+            anneal=anneal,
+            progress=progress,
         )
         return objective.total(light, traced.paths, config.losses)
 
     def combine(params: Params, totals: Totals) -> tuple[Float[Array, ""], StepReport]:
         target = rgb.astype(jnp.float32) / 255.0
-        report = objective.measure(params, totals, target, traced.dropped, config.losses)
+        losses, dropped = config.losses, traced.dropped
+        report = objective.measure(params, totals, target, dropped, losses, progress=progress)
         return report.loss, report
 
     # The sums over paths are summed over devices between the two halves.
@@ -276,6 +285,15 @@ def _anneal(step: Int[Array, ""], steps: int) -> Float[Array, ""]:
     """Returns the exponent on the proposals' weights (Mip-NeRF 360, Eq 18)."""
     progress = jnp.minimum(step.astype(jnp.float32) / max(1, steps), 1.0)
     return _ANNEAL_SLOPE * progress / ((_ANNEAL_SLOPE - 1.0) * progress + 1.0)
+
+
+def _progress(
+    step: Int[Array, ""], config: TrainConfig, model: ModelConfig
+) -> Float[Array, ""] | None:
+    """Returns the progress of the training, 0 to 1, on which only surfaces depend."""
+    if not registry.has_surface(model.field):
+        return None
+    return step.astype(jnp.float32) / require(config.schedule.steps)
 
 
 class Setup(NamedTuple):

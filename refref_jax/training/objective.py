@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Float
 
 from refref_jax import numerics
 from refref_jax.fields import hash_grid
+from refref_jax.fields.base import SurfaceSums
 from refref_jax.optics import light_paths
 from refref_jax.optics.light_paths import LightPaths
 from refref_jax.render import learned_media, pixels
@@ -31,6 +32,9 @@ from refref_jax.sampling import stepfun
 from refref_jax.training.config import LossConfig, require
 
 _CHARBONNIER_PADDING = 0.001
+
+# Share of the training in which the weight of the curvature grows; factor per training after it.
+_CURVATURE_WARMUP, _CURVATURE_DECAY = 0.25, 1.38**-2.0
 
 # Keeps the loss finite if a proposal is empty where the final histogram is not (Zip-NeRF).
 _INTERLEVEL_PADDING = 1e-5
@@ -103,6 +107,9 @@ class StepReport(NamedTuple):
       distortion: unweighted distortion loss.
       hash_decay: unweighted hash decay.
       dropped: mean dropped throughput of the batch's rays.
+      eikonal: unweighted eikonal loss, if the field has a surface.
+      curvature: unweighted curvature loss.
+      surface_share: share of the light that comes from inside the ball of the surface.
     """
 
     loss: Float[Array, ""]
@@ -111,6 +118,9 @@ class StepReport(NamedTuple):
     distortion: Float[Array, ""]
     hash_decay: Float[Array, ""]
     dropped: Float[Array, ""]
+    eikonal: Float[Array, ""] | None = None
+    curvature: Float[Array, ""] | None = None
+    surface_share: Float[Array, ""] | None = None
 
 
 class Totals(NamedTuple):
@@ -121,12 +131,14 @@ class Totals(NamedTuple):
       interlevel: sum of interlevel losses.
       distortion: sum of distortion losses.
       paths: number of paths in the interlevel and distortion losses.
+      surface: sums for the losses of a surface, if the field has one.
     """
 
     linear: Float[Array, "rays 3"]
     interlevel: Float[Array, ""]
     distortion: Float[Array, ""]
     paths: Float[Array, ""]
+    surface: SurfaceSums | None = None
 
 
 def total(light: pixels.Light, paths: LightPaths, config: LossConfig) -> Totals:
@@ -150,7 +162,8 @@ def total(light: pixels.Light, paths: LightPaths, config: LossConfig) -> Totals:
         counted = jnp.ones_like(counted)
     spread = jax.vmap(distortion)(final, counted)
     count = jnp.sum(included, dtype=missed.dtype)
-    return Totals(light.linear, missed, _sum_where(included, spread), count)
+    surface = jax.tree.map(lambda x: _sum_where(included, x), light.paths.surface)
+    return Totals(light.linear, missed, _sum_where(included, spread), count, surface)
 
 
 def measure(
@@ -159,8 +172,19 @@ def measure(
     target: Float[Array, "rays 3"],
     dropped: Float[Array, "rays 3"],
     config: LossConfig,
+    *,
+    progress: Float[Array, ""] | None = None,
 ) -> StepReport:
-    """Returns the losses of a batch; losses of paths are averaged over the included paths."""
+    """Returns the losses of a batch; losses of paths are averaged over the included paths.
+
+    Args:
+      params: parameters of the model.
+      totals: sums over all paths.
+      target: true sRGB colours of the rays.
+      dropped: dropped throughput of the rays.
+      config: weights of the losses.
+      progress: progress of the training, 0 to 1, if the field has a surface.
+    """
     rgb = pixels.linear_to_srgb(totals.linear)
     mse = mean_squared_error(rgb, target)
     data = mse if config.data == "mse" else charbonnier(rgb, target)
@@ -176,7 +200,27 @@ def measure(
         + config.tint_decay * learned_media.optical_density(params.tints)
     )
     psnr = -10.0 * jnp.log10(mse)
-    return StepReport(loss, psnr, interlevel, distortion, decay, jnp.mean(dropped))
+    report = StepReport(loss, psnr, interlevel, distortion, decay, jnp.mean(dropped))
+    if totals.surface is None:
+        return report
+    assert progress is not None
+    sums = totals.surface
+    eikonal = numerics.safe_divide(sums.eikonal, sums.samples)
+    curvature = numerics.safe_divide(sums.curvature, sums.samples)
+    weight = require(config.curvature) * curvature_schedule(progress)
+    loss += require(config.eikonal) * eikonal + weight * curvature
+    share = numerics.safe_divide(sums.share, totals.paths)
+    return report._replace(loss=loss, eikonal=eikonal, curvature=curvature, surface_share=share)
+
+
+def curvature_schedule(progress: Float[Array, ""]) -> Float[Array, ""]:
+    """Returns the factor on the weight of the curvature loss: a linear warm-up, then a decay.
+
+    Source: sdfstudio, `neus-facto`, in shares of its 20,000 steps: 5000 of warm-up, after which
+    the factor falls as the cells of a grid that is refined by 1.38 every 10,000 steps.
+    """
+    after = jnp.maximum(progress - _CURVATURE_WARMUP, 0.0)
+    return jnp.minimum(progress / _CURVATURE_WARMUP, _CURVATURE_DECAY**after)
 
 
 def _sum_where(mask: Bool[Array, " n"], values: Float[Array, " n"]) -> Float[Array, ""]:

@@ -42,7 +42,7 @@ from typing import Any
 import numpy as np
 
 from refref_jax.choices import ORIGIN, InFront, Interior, Position, Space
-from refref_jax.fields import hash_grid, msnerf, registry
+from refref_jax.fields import hash_grid, msnerf, neus, registry
 from refref_jax.fields.base import RadianceConfig
 from refref_jax.fields.hash_grid import HashGridConfig
 from refref_jax.geometry.cameras import Cameras
@@ -71,6 +71,13 @@ _PUBLISHED_UNIT = 10.0
 _PUBLISHED_NEAR = 0.05 * _PUBLISHED_UNIT
 _PUBLISHED_FAR = 15.0 * _PUBLISHED_UNIT
 _PUBLISHED_FAR_UNBOUNDED = 1000.0 * _PUBLISHED_UNIT
+
+# Radius of the ball of a surface, in distances of the nearest camera: 2.2 world units in the data
+# set, whose objects end at 2.1. In a larger ball, each camera could see a part of it by itself.
+_BALL = 0.55
+
+# Mean squared sine of the angles to a common axis below which optical axes are parallel.
+_PARALLEL = 1e-3
 
 # Blur of the interlevel loss for each proposal level (Zip-NeRF, supplement).
 _BLURS = (0.03, 0.003)
@@ -185,6 +192,48 @@ def contracted(scene: Bounds, *, radius: float | None) -> Bounds:
         ball = radius or _PUBLISHED_UNIT
         return Bounds(_PUBLISHED_NEAR, _PUBLISHED_FAR_UNBOUNDED, ball, "unbounded", scene.centre)
     return Bounds(_PUBLISHED_NEAR, _PUBLISHED_FAR, _PUBLISHED_UNIT, "unbounded", scene.centre)
+
+
+def place_surface(model: ModelConfig, cameras: Cameras) -> ModelConfig:
+    """Returns a model whose surface, if its field has one, lies in a ball between the cameras.
+
+    The ball is around the point that the cameras look at, and ends before the nearest of them; an
+    object behind a camera has no surface.
+
+    Args:
+      model: model of a preset.
+      cameras: cameras of the training images.
+
+    Raises:
+      ValueError: if space is contracted, or the cameras do not look at one place.
+    """
+    field = model.field
+    if not isinstance(field, neus.SurfaceConfig):
+        return model
+    if model.space == "unbounded":
+        raise ValueError(
+            f"field={field.kind} has a surface in a ball of the world, but the space of this scene "
+            "is contracted (background=unbounded or contraction=always). Use field=zipnerf, or "
+            "state the cube or sphere around the scene."
+        )
+    positions, axes = cameras.poses[:, :, 3], -cameras.poses[:, :, 2]
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    spread, towards = across.mean(0), np.einsum("nij,nj->i", across, positions) / len(axes)
+    focus = np.linalg.lstsq(spread, towards)[0]
+    depths = np.sum((focus - positions) * axes, axis=-1)
+    nearest = float(np.min(np.linalg.norm(positions - focus, axis=-1)))
+    beyond = float(np.max(np.abs(focus - model.centre)))
+    radius = min(_BALL * nearest, model.radius - beyond)
+    parallel = np.linalg.eigvalsh(spread)[0] < _PARALLEL
+    if parallel or radius <= 0.0 or not np.all(depths > 0.0):
+        raise ValueError(
+            f"field={field.kind} needs cameras around an object, but these do not all look at one "
+            "place in the scene. Use field=zipnerf."
+        )
+    edge = 2.0 * model.radius
+    x, y, z = (float(place) for place in 0.5 + (focus - model.centre) / edge)
+    field = dataclasses.replace(field, ball_centre=(x, y, z), ball_radius=radius / edge)
+    return dataclasses.replace(model, field=field)
 
 
 def override_model(
@@ -325,11 +374,39 @@ def loss(model: ModelConfig) -> LossConfig:
     Values that do not depend on the model are the defaults of `LossConfig`. The interlevel loss and
     its blurs are those of Zip-NeRF for every field kind.
     """
-    finest = len(_BLURS) - 1
+    finest, kind = len(_BLURS) - 1, registry.KINDS[model.field.kind]
     return LossConfig(
         blurs=tuple(_BLURS[min(i, finest)] for i in range(len(model.proposals))),
-        hash_decay=registry.KINDS[model.field.kind].hash_decay,
+        hash_decay=kind.hash_decay,
+        eikonal=kind.eikonal,
+        curvature=kind.curvature,
     )
+
+
+def losses_of(model: ModelConfig, asked: LossConfig) -> dict[str, Any]:
+    """Returns the options of a loss that depend on the model, by name.
+
+    Args:
+      model: the model.
+      asked: overrides.
+
+    Raises:
+      ValueError: if they have a weight for a surface, which the field does not have.
+    """
+    weights = {"eikonal_weight": asked.eikonal, "curvature_weight": asked.curvature}
+    for name, weight in weights.items():
+        if weight is not None and not registry.has_surface(model.field):
+            raise ValueError(
+                f"{name}={weight:g} has no effect on field kind {model.field.kind}, which has no "
+                "surface. Leave it out, or use field=neus."
+            )
+    usual = loss(model)
+    return {
+        "blurs": usual.blurs,
+        "hash_decay": usual.hash_decay,
+        "eikonal_weight": usual.eikonal,
+        "curvature_weight": usual.curvature,
+    }
 
 
 PRESETS = {

@@ -36,6 +36,7 @@ from refref_jax.data.meshes import MeshPart
 from refref_jax.data.scene_analysis import SceneAnalysis
 from refref_jax.data.scene_assembly import assemble_scene
 from refref_jax.data.scene_properties import SceneProperties
+from refref_jax.fields import registry
 from refref_jax.geometry.cameras import Cameras
 from refref_jax.optics.media import INDEX_OF_AIR
 from refref_jax.optics.path_settings import PathSettings, make_path_settings
@@ -313,6 +314,7 @@ def _resolve_model(
     extent, config = _resolve_bounds(config, facts, reasons)
     preset = presets.PRESETS[config.model.preset]
     model = preset.model(extent, require(config.model.interior), field=config.model.field)
+    model = presets.place_surface(model, facts.cameras)
     learned = facts.analysis.parts if config.model.tints == "learned" else 0
     fields = () if model.interior == "field" else facts.analysis.field_parts
     model = dataclasses.replace(model, learned_tints=learned, field_parts=fields)
@@ -369,6 +371,7 @@ def _needs_of_a_field(config: TrainConfig, facts: SceneFacts) -> list[str]:
     needs = {
         "straight rays (paths=straight)": facts.analysis.parts > 0 and not config.paths.max_bends,
         "contraction=always": config.model.contraction == "always",
+        "a surface (field=neus or unisurf)": registry.KINDS[config.model.field].depth is not None,
     }
     return [name for name, holds in needs.items() if holds]
 
@@ -454,9 +457,8 @@ def _resolve_bounds(
 def _resolve_training(
     config: TrainConfig, model: ModelConfig, reasons: dict[str, str]
 ) -> TrainConfig:
-    usual = presets.loss(model)
     why = f"field={config.model.field}"
-    config = _decide(config, reasons, why, blurs=usual.blurs, hash_decay=usual.hash_decay)
+    config = _decide(config, reasons, why, **presets.losses_of(model, config.losses))
     blurs, rounds = len(require(config.losses.blurs)), len(model.proposals)
     if blurs != rounds:
         raise ValueError(

@@ -30,7 +30,7 @@ _ADDED_SINCE = {
             ("model", name)
             for name in ("colour_network", "contraction", "near", "far", "sub_spaces")
         ),
-        ("losses", "path_losses"),
+        *(("losses", name) for name in ("path_losses", "eikonal", "curvature")),
         ("schedule", "adam_b2"),
     ],
     "model.json": [("config", "field", "colour_network")],

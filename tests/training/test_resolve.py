@@ -94,7 +94,7 @@ def test_resolve_leaves_nothing_open_and_is_idempotent(found, given):
     straight = made.model.settings.max_bends == 0
     for option in options_of():
         left = straight and option.name == "reentry"
-        left |= option.name in (*BACKDROP_ONLY, "sub_spaces")
+        left |= option.name in (*BACKDROP_ONLY, "sub_spaces", "eikonal_weight", "curvature_weight")
         assert left == (made.config.get(option.name) is None), option.name
         assert made.reasons[option.name]
     again = resolve(made.config, SceneFacts(found, CAMERAS, (), None, None, ()))
@@ -539,7 +539,7 @@ def test_shading_reaches_the_normals_of_the_scene(shading, stored):
 
 def test_a_skip_reaches_the_colour_network():
     assert _resolve(_CLEAR).model.config.field.colour_network == "plain"
-    for field in ("zipnerf", "nerfacto", "msnerf"):
+    for field in ("zipnerf", "nerfacto", "msnerf", "neus"):
         made = _resolve(_CLEAR, field=field, colour_network="skip")
         assert made.model.config.field.colour_network == "skip"
 

@@ -58,10 +58,15 @@ def test_methods_are_in_the_order_of_the_table_and_none_hides_a_reconstruction()
         "tree",
     ]
     assert {method.name for method in methods.parse(["all"])} == set(METHODS)
-    (baseline,) = methods.parse(["baselines"])
-    assert baseline.name == "msnerf" and not baseline.requires
+    baselines = methods.parse(["baselines"])
+    assert [(each.name, each.requires) for each in baselines] == [
+        ("msnerf", ()),
+        ("neus", ("walls",)),
+        ("unisurf", ("walls",)),
+    ]
     for group in ("main", "ablations"):
-        assert baseline not in methods.parse([group])
+        names = {each.name for each in methods.parse([group])}
+        assert not names & {each.name for each in baselines}
     assert {"oracle", "tree"} < {method.name for method in methods.parse(["ablations"])}
     assert RECONSTRUCTION not in METHODS
     assert METHODS["oracle_no_tir"].train == ("--paths=paper_no_tir", "--interior=field")
@@ -126,6 +131,14 @@ def test_what_a_scene_lacks_is_skipped_and_said(tmp_path, lacks, left, reason):
     names, reasons = _planned(_scene(tmp_path, **{lacks: False}), chosen)
     assert sorted(names) == sorted(left) and {*names, *reasons} == set(chosen.split(","))
     assert all(reason in each for each in reasons.values())
+
+
+def test_a_surface_is_for_scenes_with_walls(tmp_path):
+    inside = _scene(tmp_path / "inside")
+    assert _planned(inside, "neus,unisurf") == (["neus", "unisurf"], {})
+    given = dataclasses.replace(inside, options=("--background=unbounded",))
+    names, reasons = _planned(given, "straight,neus")
+    assert names == ["straight"] and "its background is infinitely far" in reasons["neus"]
 
 
 def test_a_backdrop_is_for_scenes_where_only_the_background_is_unknown(tmp_path):
