@@ -20,11 +20,10 @@ from refref_jax.geometry import surfaces, triangles
 from refref_jax.geometry.bvh import NO_PRIMITIVE
 from refref_jax.geometry.rays import Rays
 from refref_jax.geometry.surfaces import SurfacePoint
-from refref_jax.optics import fresnel, media, ray_differentials
+from refref_jax.optics import fresnel, light_paths, media
 from refref_jax.optics.fresnel import Stratum
-from refref_jax.optics.light_paths import PathStatus, Stop
+from refref_jax.optics.light_paths import Bend, PathStatus, RayDifferential, Stop
 from refref_jax.optics.path_settings import PathSettings
-from refref_jax.optics.ray_differentials import Bend, RayDifferential
 from refref_jax.optics.scene import Scene
 
 
@@ -229,7 +228,7 @@ class RayState(NamedTuple):
       num_bends: number of bends so far.
       exclude_primitive: triangle that the segment starts on, which it cannot hit.
       interior_list: interior list, the parts that the ray is in (see `media`).
-      differential: ray differential of the current segment (see `ray_differentials`).
+      differential: ray differential of the current segment (see `RayDifferential`).
       strata: pixel, number of the ray and number of rays, see `Rays`.
     """
 
@@ -320,7 +319,7 @@ def arrive(scene: Scene, state: RayState, primitive_id: Int[Array, ""]) -> Arriv
     if stratum is not None and interfaces.alpha.shape[0]:
         part = scene.surfaces.parts[primitive_id]
         tilts = fresnel.spacing(interfaces.alpha[part], stratum)
-    met, reflected, transmitted = ray_differentials.bend(
+    met, reflected, transmitted = light_paths.bend(
         surface, state.origin, state.direction, state.differential, tilts=tilts
     )
     length = numerics.length(met.position - state.point)

@@ -18,11 +18,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax.optics import queues
-from refref_jax.optics.light_paths import LightPaths, PathEnds, PathStatus, Stop
+from refref_jax.optics.light_paths import LightPaths, PathEnds, PathStatus, RayDifferential, Stop
 from refref_jax.optics.media import AMBIENT
 from refref_jax.optics.path_settings import Detail
 from refref_jax.optics.queues import Queue
-from refref_jax.optics.ray_differentials import RayDifferential
 
 NO_SEGMENT = -1
 """Parent of a camera ray's first segment."""
@@ -41,7 +40,7 @@ class Segments(NamedTuple):
       tau: arc length from the camera to the start.
       media: medium of the segment (see `media`).
       parts: part on whose surface the segment starts, or `media.EMPTY_SLOT`.
-      differentials: ray differential of the segment (see `ray_differentials`).
+      differentials: ray differential of the segment (see `RayDifferential`).
     """
 
     parents: Int[Array, " segments"]

@@ -28,7 +28,7 @@ from refref_jax.choices import Footprint
 from refref_jax.compilation import chosen_by_platform
 from refref_jax.geometry import bvh
 from refref_jax.geometry.rays import Rays
-from refref_jax.optics import media, path_settings, path_step, path_tree, queues, ray_differentials
+from refref_jax.optics import light_paths, media, path_settings, path_step, path_tree, queues
 from refref_jax.optics.light_paths import PathStatus, Stop
 from refref_jax.optics.path_settings import Capacities, PathSettings
 from refref_jax.optics.path_step import Arrival, Branches, RayState
@@ -370,7 +370,7 @@ def _begin(
     """Pushes the camera rays on the stack and stores their segments."""
     count = rays.radii.shape[0]
     order = jnp.arange(count, dtype=jnp.int32)
-    differential = jax.vmap(lambda ray: ray_differentials.begin(ray, footprint))(rays)
+    differential = jax.vmap(lambda ray: light_paths.begin_differential(ray, footprint))(rays)
     state = jax.vmap(path_step.begin)(rays, interior_list, differential)
     if media.has_dispersion(scene.interfaces):  # three rays follow each other, one per channel
         channels = jnp.eye(3, dtype=state.throughput.dtype)
