@@ -234,14 +234,14 @@ BUGS = (
     ),
     Bug(
         "weakest records are kept",
-        "optics/queues.py",
+        "optics/path_tree.py",
         "jnp.where(mask, -strength, jnp.inf)",
         "jnp.where(mask, strength, jnp.inf)",
         ("optics/test_queues.py",),
     ),
     Bug(
         "dropped light is not counted",
-        "optics/queues.py",
+        "optics/path_tree.py",
         "add(jnp.where(which[:, None], throughput, 0.0))",
         "add(jnp.where(which[:, None], 0.0, 0.0 * throughput))",
         ("optics/test_queues.py",),

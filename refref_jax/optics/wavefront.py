@@ -28,12 +28,11 @@ from refref_jax.choices import Footprint
 from refref_jax.compilation import chosen_by_platform
 from refref_jax.geometry import bvh
 from refref_jax.geometry.rays import Rays
-from refref_jax.optics import light_paths, media, path_settings, path_step, path_tree, queues
+from refref_jax.optics import light_paths, media, path_settings, path_step, path_tree
 from refref_jax.optics.light_paths import PathStatus, Stop
 from refref_jax.optics.path_settings import Capacities, PathSettings
 from refref_jax.optics.path_step import Arrival, Branches, RayState
-from refref_jax.optics.path_tree import NO_SEGMENT, Ends, PathTree, Segments
-from refref_jax.optics.queues import Queue
+from refref_jax.optics.path_tree import NO_SEGMENT, Ends, PathTree, Queue, Segments, join
 from refref_jax.optics.scene import Scene
 
 # Number of rays cast per iteration: a core's cache holds so many, with their children. On an
@@ -93,19 +92,21 @@ def children_of(
 ) -> Children:
     """Returns the child rays of the rays that bend."""
     sides = arrival.interaction.sides
-    states = queues.join(branches.reflected, branches.transmitted)
-    mediums = queues.join(sides.medium_near, sides.medium_far)
+    states = join(branches.reflected, branches.transmitted)
+    mediums = join(sides.medium_near, sides.medium_far)
     untraced = ~arrival.interaction.total & (settings.reflections == "first")
-    traced = queues.join(~untraced, jnp.ones_like(bending))
+    traced = join(~untraced, jnp.ones_like(bending))
     if settings.reentry == "impossible":
         traced &= mediums != media.AMBIENT
     return Children(
         live=Live(
-            states, queues.join(live.rays, live.rays), queues.join(live.segments, live.segments)
+            states,
+            join(live.rays, live.rays),
+            join(live.segments, live.segments),
         ),
         media=mediums,
-        parts=queues.join(sides.part, sides.part),
-        exists=queues.join(bending, bending) & (jnp.max(states.throughput, axis=-1) > 0.0),
+        parts=join(sides.part, sides.part),
+        exists=join(bending, bending) & (jnp.max(states.throughput, axis=-1) > 0.0),
         traced=traced,
     )
 
@@ -116,7 +117,7 @@ def store_segments(
     """Stores the segments of children; drops the weakest children if the buffer is full."""
     live = children.live
     left = capacities.segments - tree.segments.count
-    kept = queues.strongest(children.exists, jnp.max(live.throughput, axis=-1), left)
+    kept = path_tree.strongest(children.exists, jnp.max(live.throughput, axis=-1), left)
     index = tree.segments.count + jnp.cumsum(kept, dtype=jnp.int32) - 1
     state = live.state
     logged = Segments(
@@ -128,8 +129,10 @@ def store_segments(
         children.parts,
         state.differential,
     )
-    log = queues.append(tree.segments, logged, kept)
-    dropped = queues.add_dropped(tree.dropped, live.rays, live.throughput, children.exists & ~kept)
+    log = path_tree.append(tree.segments, logged, kept)
+    dropped = path_tree.add_dropped(
+        tree.dropped, live.rays, live.throughput, children.exists & ~kept
+    )
     children = children._replace(live=live._replace(segments=index), exists=kept)
     return tree._replace(segments=log, dropped=dropped), children
 
@@ -146,7 +149,7 @@ def push_or_end(
         escapes = (settings.reentry == "impossible") & (children.media == media.AMBIENT)
         status = jnp.where(escapes, PathStatus.ESCAPED, PathStatus.NOT_TRACED).astype(jnp.int32)
         tree = end(tree, live, status, children.exists & ~children.traced)
-    return tree, queues.append(stack, live, children.exists & children.traced)
+    return tree, path_tree.append(stack, live, children.exists & children.traced)
 
 
 def end_by(
@@ -161,7 +164,7 @@ def end_by(
     throughput = jax.vmap(functools.partial(path_step.contribution, settings))(
         live.throughput, status
     )
-    dropped = queues.add_dropped(tree.dropped, live.rays, live.throughput - throughput, ending)
+    dropped = path_tree.add_dropped(tree.dropped, live.rays, live.throughput - throughput, ending)
     live = live._replace(state=live.state._replace(throughput=throughput))
     return end(tree._replace(dropped=dropped), live, status, ending, stop=stop)
 
@@ -180,7 +183,7 @@ def end(
         tau = jnp.full_like(live.state.tau, jnp.inf)
         stop = Stop(tau, None if like.radiance is None else jnp.zeros_like(live.throughput))
     block = Ends(live.segments, live.rays, live.throughput, live.state.num_bends, status, stop)
-    return tree._replace(ends=queues.append(tree.ends, block, ending))
+    return tree._replace(ends=path_tree.append(tree.ends, block, ending))
 
 
 class _Walk(NamedTuple):
@@ -250,11 +253,11 @@ def _in_blocks(
         return _trace_remaining(scene, walk, settings, block, capacities, least=1).tree
     # Otherwise the few deepest rays would cast a full block in each iteration.
     walk = _trace_remaining(scene, walk, settings, block, capacities, least=block // 4)
-    stack = queues.append(
+    stack = path_tree.append(
         walk.stack, walk.next.items, jnp.arange(block, dtype=jnp.int32) < walk.next.count
     )
     small = block // _SMALLER
-    walk = _Walk(*queues.pop(stack, small), walk.tree)
+    walk = _Walk(*path_tree.pop(stack, small), walk.tree)
     return _trace_remaining(scene, walk, settings, small, capacities, least=1).tree
 
 
@@ -326,8 +329,8 @@ def _trace_remaining(
             lambda walk: _trace_block(scene, walk, settings, block, capacities),
             walk,
         )
-        stack, dropped = queues.drop_weakest(walk.stack, walk.tree.dropped, capacities.live)
-        ends, dropped = queues.drop_weakest(walk.tree.ends, dropped, capacities.paths)
+        stack, dropped = path_tree.drop_weakest(walk.stack, walk.tree.dropped, capacities.live)
+        ends, dropped = path_tree.drop_weakest(walk.tree.ends, dropped, capacities.paths)
         return _Walk(stack, walk.next, walk.tree._replace(ends=ends, dropped=dropped))
 
     return jax.lax.while_loop(more, advance, walk)
@@ -384,13 +387,13 @@ def _begin(
     ends = Ends(order, order, state.throughput, order, order, _no_stop(scene, state))
     # Each buffer has slots beyond its capacity for the records that one iteration may append.
     tree = PathTree(
-        segments=queues.fill(segments, count, capacities.segments + 2 * block),
-        ends=queues.fill(ends, 0, capacities.paths + 3 * block),
+        segments=path_tree.fill(segments, count, capacities.segments + 2 * block),
+        ends=path_tree.fill(ends, 0, capacities.paths + 3 * block),
         dropped=jnp.zeros_like(rays.origins),
         casts=jnp.zeros((), jnp.int32),
     )
-    stack = queues.fill(Live(state, order, order), count, capacities.live + 2 * block)
-    return _Walk(*queues.pop(stack, block), tree)
+    stack = path_tree.fill(Live(state, order, order), count, capacities.live + 2 * block)
+    return _Walk(*path_tree.pop(stack, block), tree)
 
 
 def _trace_block(
@@ -416,7 +419,7 @@ def _trace_block(
     children = children_of(live, branches, arrival, bending, settings)
     tree, children = store_segments(tree, children, capacities)
     tree, stack = push_or_end(tree, walk.stack, children, settings)
-    return _Walk(*queues.pop(stack, block), tree)
+    return _Walk(*path_tree.pop(stack, block), tree)
 
 
 def _cast(scene: Scene, state: RayState, alive: Bool[Array, " block"]) -> bvh.Hits:
