@@ -108,6 +108,9 @@ Contraction = Literal["unbounded", "always"]
 LastSample = Literal["middle", "end"]
 """Where the field is evaluated for a path's last interval; see `render.model.ModelConfig`."""
 
+SplatFilter = Literal["mip", "classic"]
+"""Opacity of blurred splats: reduced as they widen (Mip-Splatting), or kept; see `splats`."""
+
 Footprint = Literal["cone", "differential"]
 """Model of the pixel footprint along a path; see `render.model.ModelConfig`."""
 
