@@ -81,8 +81,8 @@ Paths = Literal["straight", "paper", "tree", "paper_no_reflection", "paper_no_ti
 PresetName = Literal["tiny", "small", "paper", "best"]
 """Sizes of a model and its training; see `training.presets`."""
 
-FieldName = Literal["zipnerf", "nerfacto", "msnerf"]
-"""Field kinds, the default first; see `fields.registry`."""
+FieldName = Literal["zipnerf", "nerfacto", "msnerf", "splats"]
+"""Field kinds, the default first (`fields.registry`), and Gaussian splats, which have no field."""
 
 FarField = Literal["field", "backdrop"]
 """Model of the world behind the objects: the radiance field, or a surface (`render.backdrop`)."""

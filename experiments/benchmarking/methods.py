@@ -103,6 +103,16 @@ _ALL = (
         False,
         "MS-NeRF",
     ),
+    Method(
+        "splats",
+        "Splats (MCMC)",
+        "baseline",
+        ("--field=splats",),
+        (),
+        False,
+        "Splatfacto",
+        evaluate=("--rays_per_pixel=1",),
+    ),
     Method("oracle", "Oracle (paper's paths)", "main", _ORACLE, published="Oracle"),
     Method(
         "oracle_as_published",

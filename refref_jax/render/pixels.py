@@ -22,7 +22,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from refref_jax.fields import registry
+from refref_jax.geometry.cameras import Cameras, image_rays
 from refref_jax.geometry.rays import Rays
+from refref_jax.numerics import host_array
 from refref_jax.optics import light_paths, path_tracing
 from refref_jax.optics.light_paths import LightPaths, PathStatus
 from refref_jax.render import backdrop, learned_media, volume_rendering
@@ -30,6 +32,7 @@ from refref_jax.render.model import (
     Model,
     ModelConfig,
     Params,
+    Rendering,
     has_foreground,
     path_detail,
     surface_of,
@@ -197,6 +200,47 @@ def srgb_to_linear(srgb: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     curved = srgb > _SRGB_KNEE
     power = ((jnp.where(curved, srgb, 1.0) + 0.055) / 1.055) ** 2.4
     return jnp.where(curved, power, srgb / 12.92)
+
+
+def render_splats(model: Model, cameras: Cameras, view: int, *, side: int = 1) -> Rendering:
+    """Renders Gaussian splats from a camera, as NumPy arrays `[height, width]`.
+
+    Where they stay transparent, distances are those of the scene bounds or the far plane.
+
+    Args:
+      model: model with Gaussian splats.
+      cameras: cameras with the resolution of the image.
+      view: index of the camera.
+      side: number of pixels of the image along each edge of those that it will be averaged to.
+
+    Raises:
+      ValueError: if there are several, but splats of kind `classic` are wider in larger pixels.
+    """
+    from refref_jax.splats import images  # costs nothing without splats
+
+    config = model.config
+    assert config.splats is not None
+    if side > 1 and config.splats.kernel == "classic":
+        raise ValueError(
+            "Splats with splat_filter=classic are thinner in smaller pixels, so that several rays "
+            "per pixel would show others than were trained. Use 1 ray per pixel."
+        )
+    rays = jax.tree.map(jnp.asarray, image_rays(cameras, view))
+    exits = jax.vmap(functools.partial(scene_bounds.exit_distance, config.domain))
+    flat = exits(rays.origins.reshape(-1, 3), rays.directions.reshape(-1, 3))
+    beyond = jax.device_get(jnp.where(jnp.isfinite(flat), flat, config.far))
+    beyond = beyond.reshape(rays.radii.shape)
+    kernel = config.splats.kernel
+    seen = images.render(model.params.field, cameras, view, kernel=kernel, beyond=beyond)
+    linear = jax.device_get(srgb_to_linear(jnp.asarray(seen.rgb)))
+    return Rendering(
+        rgb=jax.device_get(jnp.clip(seen.rgb, 0.0, 1.0)),
+        distance=host_array(seen.distance),
+        mean_distance=host_array(seen.mean_distance),
+        accumulation=host_array(seen.accumulation),
+        linear=linear,
+        dropped=jax.device_get(jnp.zeros_like(linear)),
+    )
 
 
 def render_ray(model: Model, ray: Rays) -> Float[Array, "3"]:

@@ -1,4 +1,4 @@
-"""3D Gaussians, their initial values, and their projection into an image.
+"""3D Gaussians, their initial values, their projection into an image, and their files.
 
 Symbols, as in Kerbl et al. (2023): a Gaussian has a mean, a covariance `Sigma = R S S^T R^T` from a
 rotation (quaternion `w, x, y, z`) and three scales, an opacity `o`, and a colour that depends on
@@ -13,6 +13,7 @@ al., Mip-Splatting (2024), for `mip`; gsplat 1.5.3, from which the limits are.
 """
 
 import math
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -22,16 +23,25 @@ from jaxtyping import Array, Float
 from scipy.spatial import KDTree
 
 from refref_jax import numerics
-from refref_jax.choices import Position, Space, SplatFilter
+from refref_jax.choices import Position, SplatFilter
 from refref_jax.fields.hash_grid import spherical_harmonics
 from refref_jax.geometry.cameras import Cameras
 from refref_jax.numerics import host_array
+from refref_jax.sampling.scene_bounds import Domain
 
 HARMONICS = 15
 """Number of spherical harmonics of degrees 1 to 3."""
 
 CONSTANT = 0.28209479177387814
 """Spherical harmonic of degree 0."""
+
+# Properties of a vertex in PLY files of splats, and the signs of their harmonics.
+_PROPERTIES = (
+    *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
+    *(f"f_rest_{n}" for n in range(3 * HARMONICS)),
+    *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+)
+_SIGNS = (-1.0) ** np.arange(1, HARMONICS + 1)
 
 # Variance that is added in the image, square pixels.
 _BLUR = 0.3
@@ -234,9 +244,7 @@ def extent(cameras: Cameras, centre: Position) -> float:
     return float(np.max(np.linalg.norm(cameras.poses[:, :, 3] - np.asarray(centre), axis=-1)))
 
 
-def start(
-    seed: int, count: int, cameras: Cameras, *, space: Space, radius: float, centre: Position
-) -> Gaussians:
+def start(seed: int, count: int, cameras: Cameras, domain: Domain) -> Gaussians:
     """Returns initial Gaussians of a scene, as NumPy arrays in single precision.
 
     Most means are on the background: the faces of the cube, or the sphere, evenly by area; with an
@@ -248,11 +256,10 @@ def start(
       seed: seed of the random numbers.
       count: number of Gaussians.
       cameras: cameras of the training images.
-      space: geometry of the background.
-      radius: half edge of the background cube or radius of its sphere, world units.
-      centre: centre of the background, world units.
+      domain: scene bounds, whose surface is the background.
     """
     draw = np.random.default_rng(seed)
+    radius, space, centre = domain
     reach = extent(cameras, centre)
     behind = math.ceil(_ON_BACKGROUND * count)
     directions = draw.normal(size=(count, 3))
@@ -291,3 +298,71 @@ def blank(count: int) -> Gaussians:
     shapes = {"log_scales": (3,), "logits": (), "harmonics": (HARMONICS, 3)}
     shapes |= {"means": (3,), "quaternions": (4,), "colours": (3,)}
     return Gaussians(**{n: jnp.zeros((count, *s), jnp.float32) for n, s in shapes.items()})
+
+
+def write_ply(path: Path, gaussians: Gaussians) -> None:
+    """Writes Gaussians as the PLY file that viewers of splats read, with float32 properties.
+
+    In that format, the harmonics of each colour follow each other, and those with an odd index have
+    the other sign.
+    """
+    flat = jax.tree.map(np.asarray, gaussians)
+    count = len(flat.means)
+    signed = _SIGNS[:, None] * flat.harmonics
+    columns = np.concatenate(
+        [
+            *(flat.means, np.zeros((count, 3)), flat.colours),
+            signed.transpose(0, 2, 1).reshape(count, 3 * HARMONICS),
+            *(flat.logits[:, None], flat.log_scales, flat.quaternions),
+        ],
+        axis=1,
+    )
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    header += [f"property float {name}" for name in _PROPERTIES]
+    with path.open("wb") as file:
+        file.write(("\n".join([*header, "end_header"]) + "\n").encode("ascii"))
+        file.write(columns.astype("<f4").tobytes())
+
+
+def read_ply(path: Path) -> Gaussians:
+    """Reads Gaussians from a PLY file of splats, as NumPy arrays.
+
+    Harmonics may have a lower degree than 3; those above are 0. Other properties are ignored.
+
+    Raises:
+      ValueError: if the file is not a binary PLY file of splats.
+    """
+    content = path.read_bytes()
+    header, end, data = content.partition(b"end_header\n")
+    lines = [line.split() for line in header.decode("ascii", "replace").splitlines()]
+    counts = [int(line[2]) for line in lines if line[:2] == ["element", "vertex"]]
+    names = [line[2] for line in lines if line[:2] == ["property", "float"]]
+    others = [line for line in lines if line[:1] == ["property"] and line[1:2] != ["float"]]
+    found = {name for name in names if name.startswith("f_rest_")}
+    required = {name for name in _PROPERTIES if name[:2] not in ("f_", "nx", "ny", "nz")}
+    missing = sorted((required | {"f_dc_0", "f_dc_1", "f_dc_2"}) - set(names))
+    size = 4 * len(names) * sum(counts)
+    binary = ["format", "binary_little_endian", "1.0"] in lines and bool(end)
+    if not binary or len(counts) != 1 or others or missing or len(data) < size or len(found) % 3:
+        raise ValueError(
+            f"{path} is not a PLY file of Gaussian splats: it must be binary_little_endian, with "
+            f"float properties, among them {', '.join(missing) or 'x, y, z and f_dc_0'}. Export it "
+            "again."
+        )
+    rows = np.frombuffer(data[:size], "<f4").reshape(counts[0], len(names)).astype(np.float32)
+
+    def columns(*wanted: str) -> np.ndarray:
+        return rows[:, [names.index(name) for name in wanted]]
+
+    each = len(found) // 3
+    rest = columns(*(f"f_rest_{n}" for n in range(len(found)))).reshape(counts[0], 3, each)
+    harmonics = np.zeros((counts[0], HARMONICS, 3), np.float32)
+    harmonics[:, :each] = rest.transpose(0, 2, 1)[:, :HARMONICS]
+    return Gaussians(
+        host_array(columns("x", "y", "z")),
+        host_array(columns("rot_0", "rot_1", "rot_2", "rot_3")),
+        host_array(columns("scale_0", "scale_1", "scale_2")),
+        host_array(columns("opacity")[:, 0]),
+        host_array(columns("f_dc_0", "f_dc_1", "f_dc_2")),
+        host_array(_SIGNS.astype(np.float32)[:, None] * harmonics),
+    )

@@ -36,8 +36,9 @@ from refref_jax.splats.rasterizer import Blended, Grid, Lists
 # Edge of a tile in pixels, on CPUs and elsewhere.
 _CPU_TILE, _TILE = 8, 16
 
-# Capacities of lists are powers of this number, so that few programs are compiled.
-_RUNG = 1.25
+# Capacities of lists are powers of this number, so that few programs are compiled; an entry takes
+# four bytes.
+_RUNG = 2.0
 
 # Background of images, sRGB, where Gaussians are transparent.
 _GREY = 0.5
@@ -184,9 +185,9 @@ class SplatImage(NamedTuple):
     accumulation: Float[np.ndarray, "h w"]
 
 
-def capacity_for(entries: float) -> int:
+def capacity_for(entries: float | int) -> int:
     """Returns a capacity for lists with a number of entries; few numbers are returned at all."""
-    rung = math.ceil(math.log(max(entries, 1.0)) / math.log(_RUNG))
+    rung = math.ceil(math.log(max(entries, 1)) / math.log(_RUNG))
     return math.ceil(_RUNG**rung) + 1
 
 

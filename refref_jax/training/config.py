@@ -30,7 +30,7 @@ FIELD_ONLY = (
     *("log2_hashmap_size", "max_res", "precision", "colour_network", "contraction", "near", "far"),
     *("data_loss", "interlevel_weight", "blurs", "distortion_weight", "hash_decay", "distortion"),
     *("path_losses", "steps", "warmup", "learning_rate", "final_learning_rate", "anneal", "batch"),
-    *("pretraced_batches", "adam_b2", "sub_spaces"),
+    *("pretraced_batches", "adam_b2", "sub_spaces", "gaussians", "splat_filter"),
 )
 """Options that only a radiance field reads."""
 
@@ -57,11 +57,8 @@ _MOST = 2**31 - 1
 
 _FINEST, _CELLS, _SEEDS, _MOST_SUB_SPACES = 2**20, 2**13, 2**32, 64
 
-# Numbers of multisamples of the patterns in `sampling.polylines`.
-_PATTERNS = (1, 6)
-
-# A 32-bit hash cannot address more entries.
-_MOST_ENTRIES = 31
+# Numbers of multisamples of the patterns in `sampling.polylines`; logarithm of a 32-bit hash.
+_PATTERNS, _MOST_ENTRIES = (1, 6), 31
 
 
 @dataclasses.dataclass(frozen=True)
@@ -137,7 +134,7 @@ class PathsConfig:
         from the meshes.
     """
 
-    name: choices.Paths | None = option(None, name="paths", after=_OBJECTS)
+    name: choices.Paths | None = option(None, name="paths", after=(*_OBJECTS, "field"))
     min_throughput: float | None = option(None, formerly="cut", after=("paths",))
     max_bends: int | None = option(None, formerly="bends", after=("paths",))
     reentry: Reentry | None = option(None, after=(*_OBJECTS, "rule", "paths", "max_bends"))
@@ -157,8 +154,11 @@ class FieldConfig:
 
     Attributes:
       preset: Size of the model and length of its training.
-      field: Field kind: zipnerf; nerfacto, without anti-aliasing; or msnerf, with sub-spaces.
+      field: Field kind: zipnerf; nerfacto, without anti-aliasing; msnerf, with sub-spaces; or, in
+        place of a field, Gaussian splats (splats).
       sub_spaces: Number of sub-spaces, only of field=msnerf.
+      gaussians: Number of Gaussians, only of field=splats.
+      splat_filter: Opacity of blurred Gaussians: reduced (mip) or kept (classic), of field=splats.
       interior: Model of the inside of the objects: a learned field (the paper), empty (clear), or
         interfaces and media that absorb light (absorbing). By default clear if all objects are
         clear in scene.json, else absorbing.
@@ -199,6 +199,8 @@ class FieldConfig:
     preset: choices.PresetName = option("tiny")
     field: choices.FieldName = option("zipnerf")
     sub_spaces: int | None = option(None, after=_KIND)
+    gaussians: int | None = option(None, after=_KIND)
+    splat_filter: choices.SplatFilter | None = option(None, after=_KIND)
     interior: choices.Interior | None = option(
         None, after=(*_OBJECTS, "paths", "max_bends", "tints")
     )
@@ -235,17 +237,15 @@ class FieldConfig:
                 f"There is no pattern with multisamples={self.multisamples}. Give 1 (on the centre "
                 "line) or 6 (Zip-NeRF's hexagon)."
             )
-        if self.max_res is not None and not 1 <= self.max_res <= _FINEST:
-            raise ValueError(f"max_res is {self.max_res}. Give 1 to {_FINEST} cells per side.")
-        ranges = {"backdrop_resolution": (4, _CELLS), "iterations": (1, _FINEST)}
-        ranges |= {"most_pixels": (1, _MOST), "sub_spaces": (1, _MOST_SUB_SPACES)}
+        ranges = dict.fromkeys(("most_pixels", "gaussians"), (1, _MOST))
+        ranges |= {"backdrop_resolution": (4, _CELLS), "iterations": (1, _FINEST)}
+        ranges |= {"sub_spaces": (1, _MOST_SUB_SPACES), "max_res": (1, _FINEST)}
         for name, (least, most) in ranges.items():
             number = getattr(self, name)
             if number is not None and not least <= number <= most:
                 raise ValueError(f"{name} is {number}. Give {least} to {most}.")
-        if self.dilation is not None and not 0.0 <= self.dilation < math.inf:
-            raise ValueError(f"dilation is {self.dilation}. Give 0 or a positive number.")
-        for name, distance in (("near", self.near), ("far", self.far)):
+        for name in ("dilation", "near", "far"):
+            distance = getattr(self, name)
             if distance is not None and not 0.0 <= distance < math.inf:
                 raise ValueError(f"{name} is {distance}. Give 0 or a positive number.")
         size = self.log2_hashmap_size

@@ -113,6 +113,7 @@ class Resolved(NamedTuple):
         model = self.model.config
         surface = model.backdrop is not None and not has_foreground(model)
         unread = {n for n in FIELD_ONLY if surface and self.reasons.get(n) != _GIVEN}
+        unread |= {*presets.unread_by_splats(self.config)}
         used = {n: x for n, x in values.items() if n not in unread}
         shown = {n: x for n, x in used.items() if x not in (None, (), "", choices.ORIGIN)}
         lines = configuration.describe(shown, self.reasons)
@@ -177,8 +178,8 @@ def resolve(config: TrainConfig, facts: SceneFacts) -> Resolved:
     Raises:
       ValueError: if overrides contradict each other or the scene.
     """
-    asked, found = config, facts.analysis
-    reasons = _first_reasons(config)
+    presets.check_splats(config)
+    asked, found, reasons = config, facts.analysis, _first_reasons(config)
     config = _decide(config, reasons, facts.origins.get("rule", _USUAL), rule=facts.rule)
     settings, config = _resolve_paths(config, found, reasons)
     config = _resolve_inside(config, found, settings, reasons)
@@ -233,7 +234,7 @@ def _resolve_paths(
             f"There are no meshes that could bend light for paths={config.paths.name}."
             " Add .ply files of the objects to the scene's folder meshes, or use paths=straight."
         )
-    name, why = ("tree", "there are meshes") if found.parts else ("straight", "there are no meshes")
+    name, why = presets.usual_paths(config.model.field, found.parts)
     config = _decide(config, reasons, why, paths=name)
     paths = config.paths
     settings = make_path_settings(
@@ -367,6 +368,7 @@ def _resolve_far_field(
 def _needs_of_a_field(config: TrainConfig, facts: SceneFacts) -> list[str]:
     """Returns what a backdrop cannot model, even with a field in front of it."""
     needs = {
+        "Gaussian splats (field=splats)": config.model.field == presets.SPLATS,
         "straight rays (paths=straight)": facts.analysis.parts > 0 and not config.paths.max_bends,
         "contraction=always": config.model.contraction == "always",
     }
