@@ -429,6 +429,20 @@ BUGS = (
         "peer = size <= _PEER *",
         ("geometry/test_corner_normals.py",),
     ),
+    Bug(
+        "light behind a splat is not divided by what passes it",
+        "splats/rasterizer.py",
+        "back.passing * colour - (total - prefix) / (1.0 - seen.alpha)",
+        "back.passing * colour - (total - prefix)",
+        ("splats/test_rasterizer.py",),
+    ),
+    Bug(
+        "splats that share a place keep their opacity",
+        "splats/training.py",
+        "new = -jnp.expm1(jnp.log1p(-held) / count.astype(held.dtype))",
+        "new = held",
+        ("splats/test_training.py",),
+    ),
 )
 
 

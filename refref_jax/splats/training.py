@@ -6,9 +6,10 @@ opaque its Gaussian is. From time to time, Gaussians that have become transparen
 opaque ones, drawn in proportion to opacity: those that share a place are made smaller and less
 opaque, so that the image stays the same. Their number is constant, so all shapes are.
 
-An environment is far away, which the published constants are not made for. Therefore learning rates
-of means and the weight of scales are relative to the distance from the centre, beyond the cameras,
-and a random move is at most half as long as the Gaussian's largest axis.
+An environment is far away, which the published constants are not made for. Therefore learning
+rates of means and the loss of scales are relative to the distance from the centre, or to that of
+the cameras if they are farther, and a random move is at most half as long as the Gaussian's largest
+axis.
 
 Everything random depends on the seed and the number of the step alone, so that a resumed run
 continues as the uninterrupted one; on a CPU, bit for bit. The capacity of the lists grows if a step
@@ -240,7 +241,7 @@ def measure(
     rendered = seen.colours + seen.transmittance[..., None] * background[None, None]
     colours = jnp.mean(jnp.abs(rendered - target))
     opacities = jnp.mean(jax.nn.sigmoid(gaussians.logits))
-    scales = jnp.exp(gaussians.log_scales) / _reach(gaussians, static)[:, None]
+    scales = jnp.exp(gaussians.log_scales) / (static.extent * _reach(gaussians, static)[:, None])
     loss = (1.0 - _BY_SIMILARITY) * colours
     loss += _BY_SIMILARITY * (1.0 - similarity(rendered, target))
     loss += _BY_OPACITY * opacities + _BY_SCALE * jnp.mean(scales)

@@ -94,7 +94,7 @@ def test_resolve_leaves_nothing_open_and_is_idempotent(found, given):
     straight = made.model.settings.max_bends == 0
     for option in options_of():
         left = straight and option.name == "reentry"
-        left |= option.name in (*BACKDROP_ONLY, "sub_spaces")
+        left |= option.name in (*BACKDROP_ONLY, "sub_spaces", "gaussians", "splat_filter")
         assert left == (made.config.get(option.name) is None), option.name
         assert made.reasons[option.name]
     again = resolve(made.config, SceneFacts(found, CAMERAS, (), None, None, ()))
