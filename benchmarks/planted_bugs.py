@@ -234,14 +234,14 @@ BUGS = (
     ),
     Bug(
         "weakest records are kept",
-        "optics/queues.py",
+        "optics/path_tree.py",
         "jnp.where(mask, -strength, jnp.inf)",
         "jnp.where(mask, strength, jnp.inf)",
         ("optics/test_queues.py",),
     ),
     Bug(
         "dropped light is not counted",
-        "optics/queues.py",
+        "optics/path_tree.py",
         "add(jnp.where(which[:, None], throughput, 0.0))",
         "add(jnp.where(which[:, None], 0.0, 0.0 * throughput))",
         ("optics/test_queues.py",),
@@ -435,6 +435,20 @@ BUGS = (
         "peer = size >= _PEER *",
         "peer = size <= _PEER *",
         ("geometry/test_corner_normals.py",),
+    ),
+    Bug(
+        "light behind a splat is not divided by what passes it",
+        "splats/rasterizer.py",
+        "back.passing * colour - (total - prefix) / (1.0 - seen.alpha)",
+        "back.passing * colour - (total - prefix)",
+        ("splats/test_rasterizer.py",),
+    ),
+    Bug(
+        "splats that share a place keep their opacity",
+        "splats/training.py",
+        "new = -jnp.expm1(jnp.log1p(-held) / count.astype(held.dtype))",
+        "new = held",
+        ("splats/test_training.py",),
     ),
 )
 

@@ -5,6 +5,7 @@ python -m experiments.export --run=runs/ball --what=mesh --out=ball.ply
     mesh      level set of the field's density at --level, and the background cube or sphere, if
               any, with normals and colours; of a field with a surface (neus, unisurf), that surface
     points    the same surfaces as points of a grid
+    splats    the Gaussians of a run with --field=splats, for viewers of splats
     object    the objects: those of R3F, or the scene's meshes; with their shading normals
     textured_mesh  the cube, sphere or environment of a backdrop, as GLB
     faces     the six faces of a backdrop in one image: PNG, or linear EXR
@@ -46,6 +47,7 @@ with epy.lazy_imports():
 _ENDINGS = {
     "mesh": (".ply",),
     "points": (".ply",),
+    "splats": (".ply",),
     "object": (".ply",),
     "textured_mesh": (".glb",),
     "faces": (".png", ".exr"),
@@ -80,11 +82,15 @@ def main() -> None:
         written = object_meshes.write(run, out, overwrite=_OVERWRITE.value)
     elif _WHAT.value in ("mesh", "points"):
         written = _write_field(_with_field(run), out)
+    elif _WHAT.value == "splats":
+        written = _write_splats(checkpoint_io.load_model(run, step=_STEP.value), run, out)
     else:
         written = _write_backdrop(checkpoint_io.load_model(run, step=_STEP.value), run, out)
     for path in written:
         print(f"Wrote:  {path}")
-    if out.suffix.lower() in (".png", ".exr"):
+    if _WHAT.value == "splats":
+        print("Next: open it with a viewer of Gaussian splats: z is up.")
+    elif out.suffix.lower() in (".png", ".exr"):
         print("Next: look at it; Blender and Mitsuba read a panorama as an environment map.")
     else:
         print("Next: open it with Blender, MeshLab or CloudCompare: z is up.")
@@ -107,9 +113,14 @@ def _with_field(run: Path) -> Model:
     """Returns the model of a run.
 
     Raises:
-      ValueError: if it has a backdrop, or a field with sub-spaces.
+      ValueError: if it has a backdrop, Gaussian splats, or a field with sub-spaces.
     """
     model = checkpoint_io.load_model(run, step=_STEP.value)
+    if model.config.splats is not None:
+        raise ValueError(
+            f"{run} consists of Gaussian splats, and has no density. Use --what=splats, or export "
+            "a run with --field=zipnerf."
+        )
     if model.config.backdrop is not None:
         raise ValueError(
             f"{run} has a backdrop, and no density around the objects. Use --what=textured_mesh, "
@@ -122,6 +133,19 @@ def _with_field(run: Path) -> Model:
             "or export a run with --field=zipnerf."
         )
     return model
+
+
+def _write_splats(model: Model, run: Path, out: Path) -> list[Path]:
+    if model.config.splats is None:
+        raise ValueError(
+            f"{run} does not consist of Gaussian splats. Train one with --field=splats, or use "
+            "--what=mesh."
+        )
+    from refref_jax.splats import gaussians
+
+    with outputs.fresh_file(out, overwrite=_OVERWRITE.value) as draft:
+        gaussians.write_ply(draft, model.params.field)
+    return [out]
 
 
 def _write_backdrop(model: Model, run: Path, out: Path) -> list[Path]:

@@ -65,7 +65,11 @@ def main() -> None:
         print(f"For videos as mp4: {video.INSTALL}")
     print(f"Images: {out / 'rgb'}")
     print(f"Distance in world units: {out / 'distance'}")
-    print(f"Next: {app.shell('view', f'--run={run}')}")
+    if model.config.splats is None:
+        print(f"Next: {app.shell('view', f'--run={run}')}")
+    else:
+        splats = ("--what=splats", f"--out={run}.ply")
+        print(f"Next: {app.shell('export', f'--run={run}', *splats)}")
 
 
 def render(model: Model, seen_by: cameras.Cameras, names: tuple[str, ...], out: Path) -> list[str]:

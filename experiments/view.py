@@ -94,6 +94,12 @@ def read_subject(heights: tuple[int, ...]) -> session.Subject:
     config = run_folder.read_config(run)
     scene = _scene(config.scene.path)
     model = checkpoint_io.load_model(run, step=_STEP.value)
+    if model.config.splats is not None:
+        raise ValueError(
+            f"{run} consists of Gaussian splats, which have no rays to show. Use "
+            "experiments.render --views=orbit, or export them for a viewer of splats with "
+            "experiments.export --what=splats."
+        )
     return session.Subject(
         name=run.resolve().name,
         model=model,

@@ -81,8 +81,8 @@ Paths = Literal["straight", "paper", "tree", "paper_no_reflection", "paper_no_ti
 PresetName = Literal["tiny", "small", "paper", "best"]
 """Sizes of a model and its training; see `training.presets`."""
 
-FieldName = Literal["zipnerf", "nerfacto", "msnerf", "neus", "unisurf"]
-"""Field kinds, the default first; see `fields.registry`."""
+FieldName = Literal["zipnerf", "nerfacto", "msnerf", "neus", "unisurf", "splats"]
+"""Field kinds, the default first (`fields.registry`), and Gaussian splats, which have no field."""
 
 FarField = Literal["field", "backdrop"]
 """Model of the world behind the objects: the radiance field, or a surface (`render.backdrop`)."""
@@ -103,10 +103,13 @@ ColourNetwork = Literal["plain", "skip"]
 """Layers of the colour network: plain, or with a skip connection; see `fields.hash_grid`."""
 
 Contraction = Literal["unbounded", "always"]
-"""Scenes whose space is contracted: unbounded ones, or all; see `training.presets.contracted`."""
+"""Scenes whose space is contracted: unbounded ones, or all; see `scene_bounds.contracted`."""
 
 LastSample = Literal["middle", "end"]
 """Where the field is evaluated for a path's last interval; see `render.model.ModelConfig`."""
+
+SplatFilter = Literal["mip", "classic"]
+"""Opacity of blurred splats: reduced as they widen (Mip-Splatting), or kept; see `splats`."""
 
 Footprint = Literal["cone", "differential"]
 """Model of the pixel footprint along a path; see `render.model.ModelConfig`."""

@@ -21,11 +21,12 @@ _FLOORS = {
     "optics": 2,
     "sampling": 3,
     "fields": 4,
-    "render": 5,
-    "metrics": 6,
-    "data": 7,
-    "training": 8,
-    "reconstruct": 8,
+    "splats": 5,
+    "render": 6,
+    "metrics": 7,
+    "data": 8,
+    "training": 9,
+    "reconstruct": 9,
 }
 
 _MODULES = sorted(_PACKAGE.rglob("*.py"))
@@ -50,6 +51,8 @@ _MAY_JIT = {
     "training/backdrop_equations.py",
     "training/backdrop_solver.py",
     "render/pixel_paths.py",
+    "splats/images.py",
+    "splats/training.py",
     "training/loop.py",
     "training/evaluation.py",
     "reconstruct/occupancy.py",

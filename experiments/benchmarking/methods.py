@@ -106,6 +106,16 @@ _ALL = (
     ),
     Method("neus", "NeuS (our fields)", "baseline", _NEUS, requires=("walls",), published="NeuS"),
     Method("unisurf", "UNISURF (our fields)", "baseline", _UNISURF, requires=("walls",)),
+    Method(
+        "splats",
+        "Splats (MCMC)",
+        "baseline",
+        ("--field=splats",),
+        (),
+        False,
+        "Splatfacto",
+        evaluate=("--rays_per_pixel=1",),
+    ),
     Method("oracle", "Oracle (paper's paths)", "main", _ORACLE, published="Oracle"),
     Method(
         "oracle_as_published",

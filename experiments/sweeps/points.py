@@ -12,9 +12,10 @@ from experiments.cli import app
 from experiments.sweeps.options import OF_EVALUATION, present_name
 from refref_jax.fields import registry
 from refref_jax.optics.path_settings import PATH_PRESETS
+from refref_jax.sampling.scene_bounds import Bounds
 from refref_jax.training import presets
 from refref_jax.training.config import BACKDROP_ONLY, FIELD_ONLY
-from refref_jax.training.presets import PRESETS, Bounds
+from refref_jax.training.presets import PRESETS
 
 BASE = "base"
 

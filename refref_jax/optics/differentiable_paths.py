@@ -32,7 +32,7 @@ from jaxtyping import Array, Bool, Int
 from refref_jax.choices import Footprint
 from refref_jax.geometry.bvh import NO_PRIMITIVE, closest_primitive
 from refref_jax.geometry.rays import Rays
-from refref_jax.optics import media, path_step, ray_differentials
+from refref_jax.optics import light_paths, media, path_step
 from refref_jax.optics.light_paths import LightPaths, PathStatus, Stop
 from refref_jax.optics.path_settings import PathSettings
 from refref_jax.optics.path_step import RayState
@@ -182,7 +182,7 @@ def _scan(
     if interior_list is None:
         interior_list = media.empty_interior_list(scene.interfaces)
     start = _Walk(
-        path_step.begin(ray, interior_list, ray_differentials.begin(ray, footprint)),
+        path_step.begin(ray, interior_list, light_paths.begin_differential(ray, footprint)),
         jnp.int32(media.AMBIENT),
         jnp.asarray(settings.max_bends > 0),
         jnp.int32(PathStatus.EMPTY),

@@ -49,7 +49,7 @@ class Detail:
       segments: `all` segments, or only those `outside` the objects and the last one.
       most: maximum number of segments per path; `all` needs max bends + 1. Of a longer path, the
         first segment and the last ones are kept.
-      footprint: `differential` carries derivatives across the pixel (see `ray_differentials`).
+      footprint: `differential` carries derivatives across the pixel (see `RayDifferential`).
       tally: `parts` stores each path's hit counts and path lengths per part.
     """
 

@@ -20,11 +20,10 @@ from refref_jax.geometry import surfaces
 from refref_jax.geometry.bvh import NO_PRIMITIVE
 from refref_jax.geometry.rays import Rays, intersect
 from refref_jax.geometry.surfaces import SurfacePoint
-from refref_jax.optics import fresnel, media, microfacet, ray_differentials
-from refref_jax.optics.light_paths import PathStatus, Stop
-from refref_jax.optics.microfacet import Stratum
+from refref_jax.optics import fresnel, light_paths, media
+from refref_jax.optics.fresnel import Stratum
+from refref_jax.optics.light_paths import Bend, PathStatus, RayDifferential, Stop
 from refref_jax.optics.path_settings import PathSettings
-from refref_jax.optics.ray_differentials import Bend, RayDifferential
 from refref_jax.optics.scene import Scene
 
 
@@ -69,7 +68,7 @@ def interact(
     """Reflects and refracts a ray at an interface.
 
     If the shading normal would send either ray to the wrong side of the triangle, the geometric
-    normal is used for both. On a rough surface, both rays leave one facet (see `microfacet`).
+    normal is used for both. On a rough surface, both rays leave one facet (see `fresnel`).
 
     Args:
       point: hit point of the ray.
@@ -88,9 +87,9 @@ def interact(
     alpha = interfaces.alpha[point.part] if interfaces.alpha.shape[0] else None
     facet = normal
     if alpha is not None:
-        numbers = microfacet.uniform_pair(point.position, direction, stratum=stratum)
-        facet = microfacet.facet_normal(direction, normal, alpha, numbers)
-        facet = facet if tilt is None else microfacet.tilted(facet, tilt)
+        numbers = fresnel.uniform_pair(point.position, direction, stratum=stratum)
+        facet = fresnel.facet_normal(direction, normal, alpha, numbers)
+        facet = facet if tilt is None else fresnel.tilted(facet, tilt)
     near, far = sides.index_near, sides.index_far
     beta = -numerics.dot(direction, facet)
     # Directions are renormalised, or rounding errors would accumulate over bends.
@@ -149,7 +148,7 @@ def _unmasked(
     leaving = jnp.stack(
         [numerics.dot(met.reflected, normal), -numerics.dot(met.transmitted, normal)]
     )
-    shares = jax.vmap(microfacet.masking, in_axes=(None, 0, None))(towards, leaving, alpha)
+    shares = jax.vmap(fresnel.masking, in_axes=(None, 0, None))(towards, leaving, alpha)
     if met.sides.kind is None:
         return shares
     # A thin sheet transmits straight on, without facets.
@@ -229,7 +228,7 @@ class RayState(NamedTuple):
       num_bends: number of bends so far.
       exclude_primitive: triangle that the segment starts on, which it cannot hit.
       interior_list: interior list, the parts that the ray is in (see `media`).
-      differential: ray differential of the current segment (see `ray_differentials`).
+      differential: ray differential of the current segment (see `RayDifferential`).
       strata: pixel, number of the ray and number of rays, see `Rays`.
     """
 
@@ -319,8 +318,8 @@ def arrive(scene: Scene, state: RayState, primitive_id: Int[Array, ""]) -> Arriv
     tilts = None
     if stratum is not None and interfaces.alpha.shape[0]:
         part = scene.surfaces.parts[primitive_id]
-        tilts = microfacet.spacing(interfaces.alpha[part], stratum)
-    met, reflected, transmitted = ray_differentials.bend(
+        tilts = fresnel.spacing(interfaces.alpha[part], stratum)
+    met, reflected, transmitted = light_paths.bend(
         surface, state.origin, state.direction, state.differential, tilts=tilts
     )
     length = numerics.length(met.position - state.point)

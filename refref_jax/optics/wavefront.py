@@ -28,12 +28,19 @@ from refref_jax.choices import Footprint
 from refref_jax.compilation import chosen_by_platform
 from refref_jax.geometry import bvh
 from refref_jax.geometry.rays import Rays
-from refref_jax.optics import media, path_settings, path_step, path_tree, queues, ray_differentials
+from refref_jax.optics import light_paths, media, path_settings, path_step, path_tree
 from refref_jax.optics.light_paths import PathStatus, Stop
 from refref_jax.optics.path_settings import Capacities, PathSettings
 from refref_jax.optics.path_step import Arrival, Branches, RayState
-from refref_jax.optics.path_tree import NO_SEGMENT, Ends, LastSegments, PathTree, Segments
-from refref_jax.optics.queues import Queue
+from refref_jax.optics.path_tree import (
+    NO_SEGMENT,
+    Ends,
+    LastSegments,
+    PathTree,
+    Queue,
+    Segments,
+    join,
+)
 from refref_jax.optics.scene import Scene
 
 StoredSegments = Literal["all", "last"]
@@ -91,22 +98,22 @@ def children_of(
 ) -> Children:
     """Returns the child rays of the rays that bend."""
     sides = arrival.interaction.sides
-    states = queues.join(branches.reflected, branches.transmitted)
-    mediums = queues.join(sides.medium_near, sides.medium_far)
+    states = join(branches.reflected, branches.transmitted)
+    mediums = join(sides.medium_near, sides.medium_far)
     untraced = ~arrival.interaction.total & (settings.reflections == "first")
-    traced = queues.join(~untraced, jnp.ones_like(bending))
+    traced = join(~untraced, jnp.ones_like(bending))
     if settings.reentry == "impossible":
         traced &= mediums != media.AMBIENT
     return Children(
         live=Live(
             states,
-            queues.join(live.rays, live.rays),
-            queues.join(live.segments, live.segments),
+            join(live.rays, live.rays),
+            join(live.segments, live.segments),
             None if live.media is None else mediums,
         ),
         media=mediums,
-        parts=queues.join(sides.part, sides.part),
-        exists=queues.join(bending, bending) & (jnp.max(states.throughput, axis=-1) > 0.0),
+        parts=join(sides.part, sides.part),
+        exists=join(bending, bending) & (jnp.max(states.throughput, axis=-1) > 0.0),
         traced=traced,
     )
 
@@ -120,14 +127,16 @@ def store_segments(
     """
     live = children.live
     left = capacities.segments - tree.segments.count
-    kept = queues.strongest(children.exists, jnp.max(live.throughput, axis=-1), left)
+    kept = path_tree.strongest(children.exists, jnp.max(live.throughput, axis=-1), left)
     log, logged = tree.segments, None
     if log.items is not None:
         logged = _segments(live.state, live.segments, children.media, children.parts)
         index = log.count + jnp.cumsum(kept, dtype=jnp.int32) - 1
         children = children._replace(live=live._replace(segments=index))
-    log = queues.append(log, logged, kept)
-    dropped = queues.add_dropped(tree.dropped, live.rays, live.throughput, children.exists & ~kept)
+    log = path_tree.append(log, logged, kept)
+    dropped = path_tree.add_dropped(
+        tree.dropped, live.rays, live.throughput, children.exists & ~kept
+    )
     return tree._replace(segments=log, dropped=dropped), children._replace(exists=kept)
 
 
@@ -163,7 +172,7 @@ def push_or_end(
         escapes = (settings.reentry == "impossible") & (children.media == media.AMBIENT)
         status = jnp.where(escapes, PathStatus.ESCAPED, PathStatus.NOT_TRACED).astype(jnp.int32)
         tree = end(tree, live, status, children.exists & ~children.traced)
-    return tree, queues.append(stack, live, children.exists & children.traced)
+    return tree, path_tree.append(stack, live, children.exists & children.traced)
 
 
 def end_by(
@@ -178,7 +187,7 @@ def end_by(
     throughput = jax.vmap(functools.partial(path_step.contribution, settings))(
         live.throughput, status
     )
-    dropped = queues.add_dropped(tree.dropped, live.rays, live.throughput - throughput, ending)
+    dropped = path_tree.add_dropped(tree.dropped, live.rays, live.throughput - throughput, ending)
     live = live._replace(state=live.state._replace(throughput=throughput))
     return end(tree._replace(dropped=dropped), live, status, ending, stop=stop)
 
@@ -198,7 +207,7 @@ def end(
         stop = Stop(tau, None if like.radiance is None else jnp.zeros_like(live.throughput))
     state, last = live.state, _last_segments(live)
     block = Ends(live.segments, live.rays, live.throughput, state.num_bends, status, stop, last)
-    return tree._replace(ends=queues.append(tree.ends, block, ending))
+    return tree._replace(ends=path_tree.append(tree.ends, block, ending))
 
 
 class _Walk(NamedTuple):
@@ -353,8 +362,8 @@ def _trace_remaining(
             lambda walk: _trace_block(scene, walk, settings, block, capacities),
             walk,
         )
-        stack, dropped = queues.drop_weakest(walk.stack, walk.tree.dropped, capacities.live)
-        ends, dropped = queues.drop_weakest(walk.tree.ends, dropped, capacities.paths)
+        stack, dropped = path_tree.drop_weakest(walk.stack, walk.tree.dropped, capacities.live)
+        ends, dropped = path_tree.drop_weakest(walk.tree.ends, dropped, capacities.paths)
         return _Walk(stack, walk.next, walk.tree._replace(ends=ends, dropped=dropped))
 
     return jax.lax.while_loop(more, advance, walk)
@@ -398,7 +407,7 @@ def _begin(
     """Pushes the camera rays on the stack and stores their segments."""
     count = rays.radii.shape[0]
     order = jnp.arange(count, dtype=jnp.int32)
-    differential = jax.vmap(lambda ray: ray_differentials.begin(ray, kind.footprint))(rays)
+    differential = jax.vmap(lambda ray: light_paths.begin_differential(ray, kind.footprint))(rays)
     state = jax.vmap(path_step.begin)(rays, interior_list, differential)
     if media.has_dispersion(scene.interfaces):  # three rays follow each other, one per channel
         channels = jnp.eye(3, dtype=state.throughput.dtype)
@@ -412,13 +421,13 @@ def _begin(
     ends = Ends(live.segments, order, state.throughput, order, order, stop, last)
     # Each buffer has slots beyond its capacity for the records that one iteration may append.
     tree = PathTree(
-        segments=queues.fill(segments, count, capacities.segments + 2 * block),
-        ends=queues.fill(ends, 0, capacities.paths + 3 * block),
+        segments=path_tree.fill(segments, count, capacities.segments + 2 * block),
+        ends=path_tree.fill(ends, 0, capacities.paths + 3 * block),
         dropped=jnp.zeros_like(rays.origins),
         casts=jnp.zeros((), jnp.int32),
     )
-    stack = queues.fill(live, count, capacities.live + 2 * block)
-    return _Walk(*queues.pop(stack, block), tree)
+    stack = path_tree.fill(live, count, capacities.live + 2 * block)
+    return _Walk(*path_tree.pop(stack, block), tree)
 
 
 def _trace_block(
@@ -448,7 +457,7 @@ def _trace_block(
     children = children_of(live, branches, arrival, bending, settings)
     tree, children = store_segments(tree, children, capacities)
     tree, stack = push_or_end(tree, walk.stack, children, settings)
-    return _Walk(*queues.pop(stack, block), tree)
+    return _Walk(*path_tree.pop(stack, block), tree)
 
 
 def _cast(scene: Scene, state: RayState, alive: Bool[Array, " block"]) -> bvh.Hits:

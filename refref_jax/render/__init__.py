@@ -30,4 +30,4 @@ from refref_jax.render.model import Model as Model
 from refref_jax.render.model import ModelConfig as ModelConfig
 from refref_jax.render.model import Params as Params
 from refref_jax.render.model import init_params as init_params
-from refref_jax.render.one_ray import render_ray as render_ray
+from refref_jax.render.pixels import render_ray as render_ray

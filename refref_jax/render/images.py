@@ -36,6 +36,7 @@ from refref_jax.optics.path_tracing import Traced
 from refref_jax.optics.scene import Scene
 from refref_jax.render import learned_media, pixels
 from refref_jax.render.model import Model, ModelConfig, Params, path_detail
+from refref_jax.render.model import Rendering as Rendering
 
 # Padding rays of a tile start at this distance and point away from the scene: they hit nothing and
 # leave the capacity of the path buffers to the other rays.
@@ -165,27 +166,6 @@ def crop(
     )
     nowhere = jax.tree.map(lambda x: np.full((missing, x.shape[1]), EMPTY_SLOT, x.dtype), within)
     return jax.tree.map(lambda a, b: np.concatenate([a, b]), (part, within), (filling, nowhere))
-
-
-class Rendering(NamedTuple):
-    """Rendered rays. The leading axes are those of the rays.
-
-    Attributes:
-      rgb: sRGB colours in `[0, 1]`.
-      distance: median distance along the ray's heaviest path, as arc length from the camera in
-        world units.
-      mean_distance: mean distance along the ray's heaviest path.
-      accumulation: sum of the weights, 1 with an opaque background.
-      linear: linear RGB colours, not clipped, for averaging the rays of a pixel.
-      dropped: dropped throughput of each ray, because a path buffer was full.
-    """
-
-    rgb: Float[Array, "*rays 3"]
-    distance: Float[Array, "*rays"]
-    mean_distance: Float[Array, "*rays"]
-    accumulation: Float[Array, "*rays"]
-    linear: Float[Array, "*rays 3"]
-    dropped: Float[Array, "*rays 3"]
 
 
 class _Tile(NamedTuple):
@@ -376,7 +356,8 @@ def render_camera(
 ) -> Rendering:
     """Renders one camera's image, with one or several rays in every pixel.
 
-    Rows of pixels are rendered band by band, so that memory does not grow with the image.
+    Rows of pixels are rendered band by band, so that memory does not grow with the image. Gaussian
+    splats are rendered at once, also those of pixels of a size that they were not trained with.
 
     Args:
       model: trained model.
@@ -390,11 +371,14 @@ def render_camera(
       NumPy arrays as `[height, width]`, see `average`.
 
     Raises:
-      ValueError: if the rays of a pixel do not make a square grid.
+      ValueError: if the rays of a pixel do not make a square grid, or several are requested of
+        Gaussian splats of kind `classic`.
       TypeError: if it is called in a function that JAX transforms.
     """
     side = side_of(rays_per_pixel)
     fine = supersample(cameras, side)
+    if model.config.splats is not None:
+        return average(pixels.render_splats(model, fine, view, side=side), side)
     bands = [
         average(render_image(model, rays, chunk=chunk), side)
         for rays in _bands(fine, view, rows=side * max(1, band // (side * fine.width)))
@@ -404,7 +388,7 @@ def render_camera(
 
 def warm_up(model: Model, cameras: Cameras, *, rays_per_pixel: int, chunk: int | None) -> None:
     """Compiles all programs of `render_camera`, so that later timings are of rendering alone."""
-    if runs_on_cpu():  # where one tile size serves all images
+    if runs_on_cpu() and model.config.splats is None:  # one tile size serves all images
         render_image(model, pixel_rays(cameras, *np.zeros((3, 1), np.int64)), chunk=chunk)
     else:
         render_camera(model, cameras, 0, rays_per_pixel=rays_per_pixel, chunk=chunk)

@@ -23,6 +23,7 @@ from refref_jax.choices import (
     LastSample,
     Position,
     Space,
+    SplatFilter,
     ViewDependence,
 )
 from refref_jax.fields import base, registry
@@ -87,6 +88,25 @@ class BackdropConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class SplatsConfig:
+    """Shape of a model of Gaussian splats.
+
+    Attributes:
+      gaussians: number of Gaussians.
+      kernel: opacity of blurred Gaussians, see `splats.gaussians.project`.
+    """
+
+    gaussians: int
+    kernel: SplatFilter
+
+    def __post_init__(self) -> None:
+        """Checks the values."""
+        if self.gaussians < 1:
+            raise ValueError(f"gaussians is {self.gaussians}. Give a positive number.")
+        _check_choice("kernel", self.kernel, get_args(SplatFilter))
+
+
+@dataclasses.dataclass(frozen=True)
 class ModelConfig:
     """Configuration of a model of a scene.
 
@@ -118,6 +138,7 @@ class ModelConfig:
       last_sample: where the field is evaluated for the last, opaque interval: in its `middle`,
         as in models of earlier versions, or at the `end` of the path, which is on a surface if the
         scene is bounded or spherical; if it is unbounded, always in the middle.
+      splats: Gaussians that take the place of all fields, or `None`.
     """
 
     proposals: tuple[ProposalConfig, ...]
@@ -136,6 +157,7 @@ class ModelConfig:
     centre: Position = ORIGIN
     backdrop: BackdropConfig | None = None
     last_sample: LastSample = "middle"
+    splats: SplatsConfig | None = None
 
     @property
     def domain(self) -> scene_bounds.Domain:
@@ -166,7 +188,16 @@ class ModelConfig:
 
 
 def path_detail(config: ModelConfig, settings: PathSettings) -> Detail:
-    """Returns the parts of light paths that a model needs."""
+    """Returns the parts of light paths that a model needs.
+
+    Raises:
+      ValueError: if the model has Gaussian splats.
+    """
+    if config.splats is not None:
+        raise ValueError(
+            "This model consists of Gaussian splats, which are seen by cameras instead of along "
+            "rays. Use render_camera, or train with another field, such as field=zipnerf."
+        )
     tally: Tally = "parts" if config.learned_tints else "none"
     most = settings.max_bends + 1
     samples_inside = config.interior == "field" or bool(config.field_parts)
@@ -195,12 +226,34 @@ class Layers(NamedTuple):
     backdrop: Pyramid
 
 
+class Rendering(NamedTuple):
+    """Rendered rays. The leading axes are those of the rays.
+
+    Attributes:
+      rgb: sRGB colours in `[0, 1]`.
+      distance: median distance along the ray's heaviest path, as arc length from the camera in
+        world units.
+      mean_distance: mean distance along the ray's heaviest path.
+      accumulation: sum of the weights, 1 with an opaque background.
+      linear: linear RGB colours, not clipped, for averaging the rays of a pixel.
+      dropped: dropped throughput of each ray, because a path buffer was full.
+    """
+
+    rgb: Float[Array, "*rays 3"]
+    distance: Float[Array, "*rays"]
+    mean_distance: Float[Array, "*rays"]
+    accumulation: Float[Array, "*rays"]
+    linear: Float[Array, "*rays 3"]
+    dropped: Float[Array, "*rays 3"]
+
+
 class Params(NamedTuple):
     """The learned part of a model.
 
     Attributes:
       proposals: parameters of each proposal level's density field.
-      field: parameters of the radiance field, the pyramid of a backdrop, or both (`Layers`).
+      field: parameters of the radiance field, the pyramid of a backdrop, or both (`Layers`); or
+        Gaussian splats.
       tints: learned tints and absorption of the parts, if any.
     """
 
@@ -226,7 +279,11 @@ class Model(NamedTuple):
 
 
 def init_params(key: Array, config: ModelConfig) -> Params:
-    """Returns initial parameters of all fields of a model."""
+    """Returns initial parameters of all fields of a model; of Gaussian splats, their shapes."""
+    if config.splats is not None:
+        from refref_jax.splats import gaussians  # costs nothing without splats
+
+        return Params((), gaussians.blank(config.splats.gaussians), None)
     colours = learned_media.init(config.learned_tints) if config.learned_tints else None
     if config.backdrop is not None and not has_foreground(config):
         surface = backdrop.init(config.backdrop.resolution, axes=config.backdrop.axes)
@@ -284,9 +341,14 @@ def look_up(
       width: edge of the cell around the point, world units: finer detail is blurred.
 
     Raises:
-      ValueError: if the model has a backdrop instead of fields, or its field has sub-spaces or a
-        surface.
+      ValueError: if the model has a backdrop or Gaussian splats instead of fields, or its field has
+        sub-spaces or a surface.
     """
+    if config.splats is not None:
+        raise ValueError(
+            "This model has Gaussian splats in place of a field, so there is no density to look "
+            "up. Train it with field=zipnerf."
+        )
     if config.backdrop is not None:
         raise ValueError(
             "This model has a backdrop in place of a field, so there is no density to look up. "

@@ -7,7 +7,7 @@ its inner segments shrunk to length zero, so that no sample falls inside.
 An interval of a path is a conical frustum, represented by a few multisamples, each an isotropic
 Gaussian, so that a field can blur detail that is finer than the pixel's footprint. The centre line
 follows the bends. The width of the cone grows with arc length, as along a straight ray, or is that
-of the ray differentials, if they are carried (`optics.ray_differentials`).
+of the ray differentials, if they are carried (`optics.light_paths`).
 
 Source of the multisamples: Barron et al., Zip-NeRF (2023), section 2; paper (arXiv 2505.05848),
 supplement, for the bent centre line.
@@ -22,10 +22,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax import numerics
 from refref_jax.geometry.rays import orthonormal_basis
-from refref_jax.optics import ray_differentials
-from refref_jax.optics.light_paths import LightPaths
+from refref_jax.optics import light_paths
+from refref_jax.optics.light_paths import LightPaths, RayDifferential
 from refref_jax.optics.media import AMBIENT
-from refref_jax.optics.ray_differentials import RayDifferential
 
 # Angles of Zip-NeRF's hexagon: two triangles of points, the second rotated by half a turn.
 _HEXAGON = tuple(math.pi * turn for turn in (0.0, 2.0 / 3.0, 4.0 / 3.0, 1.0, 5.0 / 3.0, 1.0 / 3.0))
@@ -172,7 +171,7 @@ def _footprint(
     if line.differentials.points.shape[-2] == 0:
         return line.radius * arc * jnp.stack(orthonormal_basis(direction))
     differential = jax.tree.map(lambda x: x[segment], line.differentials)
-    return ray_differentials.across(differential, along, direction)
+    return light_paths.across(differential, along, direction)
 
 
 def _outside(path: LightPaths) -> Bool[Array, " segments"]:

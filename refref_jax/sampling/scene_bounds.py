@@ -13,16 +13,94 @@ for the scale of a contracted Gaussian, and section 4 for the warp of distance, 
 transformation with `lambda = -1.5`, applied to twice the distance.
 """
 
+import dataclasses
+import math
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from refref_jax import numerics
 from refref_jax.choices import ORIGIN, Position, Space
+from refref_jax.geometry.cameras import Cameras
 from refref_jax.sampling.polylines import Gaussians
 
 _LAMBDA = -1.5
+
+_WALLS = 7.3
+"""Default half edge of the background cube, or radius of the background sphere: the data set's.
+
+Paths end there, on an opaque background, so the value must be exact: a cube that is 3 % too large
+costs 2.7 dB.
+"""
+
+_NEAR = 0.05
+_FAR_UNBOUNDED = 1000.0
+
+# World units per unit of the paper's released code (`--scale-factor 0.1`), whose near plane is
+# 0.05, and whose far plane is 15, or 1000 in unbounded scenes. It contracts space beyond one unit.
+_PUBLISHED_UNIT = 10.0
+_PUBLISHED_NEAR = 0.05 * _PUBLISHED_UNIT
+_PUBLISHED_FAR = 15.0 * _PUBLISHED_UNIT
+_PUBLISHED_FAR_UNBOUNDED = 1000.0 * _PUBLISHED_UNIT
+
+
+@dataclasses.dataclass(frozen=True)
+class Bounds:
+    """Bounds of a scene; see `ModelConfig`."""
+
+    near: float
+    far: float
+    radius: float
+    space: Space
+    centre: Position = ORIGIN
+
+
+def bounds(
+    cameras: Cameras, *, space: Space, radius: float | None, centre: Position = ORIGIN
+) -> Bounds:
+    """Returns the bounds of a scene.
+
+    A bounded scene extends from any camera to the farthest corner of its cube, a spherical scene to
+    the far side of its sphere. In an unbounded scene, the cameras and the space between them are
+    not contracted.
+
+    Args:
+      cameras: cameras of the training images.
+      space: geometry of the background: `bounded`, `spherical` or `unbounded`.
+      radius: radius instead of the default of `ModelConfig.radius`.
+      centre: centre of the background, world units.
+
+    Raises:
+      ValueError: if the radius is not positive and finite.
+    """
+    if radius is not None and not 0.0 < radius < math.inf:
+        raise ValueError(
+            f"radius is {radius}, but it is a length. Give a positive number of world units."
+        )
+    farthest = float(np.max(np.linalg.norm(cameras.poses[:, :, 3] - centre, axis=-1)))
+    if space == "unbounded":
+        return Bounds(_NEAR, _FAR_UNBOUNDED, radius or 1.25 * farthest, space, centre)
+    radius = radius or _WALLS
+    reach = radius if space == "spherical" else math.sqrt(3.0) * radius
+    return Bounds(_NEAR, farthest + reach, radius, space, centre)
+
+
+def contracted(scene: Bounds, *, radius: float | None) -> Bounds:
+    """Returns bounds that ignore the size of the background: space is contracted around its centre.
+
+    Args:
+      scene: bounds of the scene.
+      radius: radius of an unbounded scene's uncontracted ball, world units; by default, and in
+        other scenes, that of the released code.
+
+    Source: the paper's released code, in world units.
+    """
+    if scene.space == "unbounded":
+        ball = radius or _PUBLISHED_UNIT
+        return Bounds(_PUBLISHED_NEAR, _PUBLISHED_FAR_UNBOUNDED, ball, "unbounded", scene.centre)
+    return Bounds(_PUBLISHED_NEAR, _PUBLISHED_FAR, _PUBLISHED_UNIT, "unbounded", scene.centre)
 
 
 class Domain(NamedTuple):

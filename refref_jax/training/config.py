@@ -30,6 +30,7 @@ FIELD_ONLY = (
     *("data_loss", "interlevel_weight", "blurs", "distortion_weight", "hash_decay", "distortion"),
     *("path_losses", "steps", "warmup", "learning_rate", "final_learning_rate", "anneal", "batch"),
     *("pretraced_batches", "adam_b2", "sub_spaces", "eikonal_weight", "curvature_weight"),
+    *("gaussians", "splat_filter"),
 )
 """Options that only a radiance field reads."""
 
@@ -51,14 +52,11 @@ _BOUNDS = ("scene", "properties", "background", "radius", "contraction")
 # Options that determine the number of samples.
 _SAMPLES = (*_BOUNDS, *_OBJECTS, "centre", "paths", "max_bends", "interior", "far_field", *_KIND)
 
-# Maximum number of steps, rays and batches, which are 32-bit integers.
-_MOST = 2**31 - 1
-_FINEST, _CELLS, _SEEDS, _MOST_SUB_SPACES = 2**20, 2**13, 2**32, 64
+# Most steps, rays and batches, which are 32-bit integers, and others.
+_MOST, _FINEST, _CELLS, _SEEDS, _MOST_SUB_SPACES = 2**31 - 1, 2**20, 2**13, 2**32, 64
 
-# Numbers of multisamples of the patterns in `sampling.polylines`.
-_PATTERNS = (1, 6)
-# A 32-bit hash cannot address more entries.
-_MOST_ENTRIES = 31
+# Numbers of multisamples of the patterns in `sampling.polylines`; logarithm of a 32-bit hash.
+_PATTERNS, _MOST_ENTRIES = (1, 6), 31
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,7 +132,7 @@ class PathsConfig:
         from the meshes.
     """
 
-    name: choices.Paths | None = option(None, name="paths", after=_OBJECTS)
+    name: choices.Paths | None = option(None, name="paths", after=(*_OBJECTS, "field"))
     min_throughput: float | None = option(None, formerly="cut", after=("paths",))
     max_bends: int | None = option(None, formerly="bends", after=("paths",))
     reentry: Reentry | None = option(None, after=(*_OBJECTS, "rule", "paths", "max_bends"))
@@ -154,9 +152,11 @@ class FieldConfig:
 
     Attributes:
       preset: Size of the model and length of its training.
-      field: Field kind: zipnerf; nerfacto, without anti-aliasing; msnerf, with sub-spaces; or
-        neus or unisurf, with the surface of an opaque object.
+      field: Field kind: zipnerf; nerfacto, without anti-aliasing; msnerf, with sub-spaces; neus or
+        unisurf, with the surface of an opaque object; or, in place of a field, Gaussian splats.
       sub_spaces: Number of sub-spaces, only of field=msnerf.
+      gaussians: Number of Gaussians, only of field=splats.
+      splat_filter: Opacity of blurred Gaussians: reduced (mip) or kept (classic), of field=splats.
       interior: Model of the inside of the objects: a learned field (the paper), empty (clear), or
         interfaces and media that absorb light (absorbing). By default clear if all objects are
         clear in scene.json, else absorbing.
@@ -197,6 +197,8 @@ class FieldConfig:
     preset: choices.PresetName = option("tiny")
     field: choices.FieldName = option("zipnerf")
     sub_spaces: int | None = option(None, after=_KIND)
+    gaussians: int | None = option(None, after=_KIND)
+    splat_filter: choices.SplatFilter | None = option(None, after=_KIND)
     interior: choices.Interior | None = option(
         None, after=(*_OBJECTS, "paths", "max_bends", "tints")
     )
@@ -233,20 +235,18 @@ class FieldConfig:
                 f"There is no pattern with multisamples={self.multisamples}. Give 1 (on the centre "
                 "line) or 6 (Zip-NeRF's hexagon)."
             )
-        if self.max_res is not None and not 1 <= self.max_res <= _FINEST:
-            raise ValueError(f"max_res is {self.max_res}. Give 1 to {_FINEST} cells per side.")
-        ranges = {"backdrop_resolution": (4, _CELLS), "iterations": (1, _FINEST)}
-        ranges |= {"most_pixels": (1, _MOST), "sub_spaces": (1, _MOST_SUB_SPACES)}
+        ranges = dict.fromkeys(("most_pixels", "gaussians"), (1, _MOST))
+        ranges |= {"backdrop_resolution": (4, _CELLS), "iterations": (1, _FINEST)}
+        ranges |= {"sub_spaces": (1, _MOST_SUB_SPACES), "max_res": (1, _FINEST)}
         for name, (least, most) in ranges.items():
             number = getattr(self, name)
             if number is not None and not least <= number <= most:
                 raise ValueError(f"{name} is {number}. Give {least} to {most}.")
         for name in ("dilation", "near", "far"):
-            number = getattr(self, name)
-            if number is not None and not 0.0 <= number < math.inf:
+            if (number := getattr(self, name)) is not None and not 0.0 <= number < math.inf:
                 raise ValueError(f"{name} is {number}. Give 0 or a positive number.")
-        size = self.log2_hashmap_size
-        if size is not None and not 1 <= size <= _MOST_ENTRIES:
+        if self.log2_hashmap_size not in (None, *range(1, _MOST_ENTRIES + 1)):
+            size = self.log2_hashmap_size
             raise ValueError(
                 f"log2_hashmap_size is {size}, but it is the base-2 logarithm of a table's size. "
                 f"Give 1 to {_MOST_ENTRIES}, such as 17 for 131,072 entries."

@@ -9,10 +9,11 @@ calls them in this order; the command `train` calls it as well.
 """
 
 import contextlib
+import functools
 import math
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -26,14 +27,10 @@ from refref_jax.data.meshes import MeshPart
 from refref_jax.optics.scene import Scene
 from refref_jax.render import checkpoint_io
 from refref_jax.render.checkpoint_io import SavedModel
-from refref_jax.render.model import (
-    Model,
-    has_foreground,
-)
+from refref_jax.render.model import Model, ModelConfig, Params, has_foreground
 from refref_jax.training import backdrop_equations, backdrop_fit, devices, loop, run_folder
 from refref_jax.training.config import TrainConfig, require
 from refref_jax.training.loop import TrainState, init_state
-from refref_jax.training.objective import StepReport
 from refref_jax.training.resolve import Resolved, build_scene, read_facts, resolve
 from refref_jax.training.run_folder import Checkpoints
 
@@ -270,34 +267,88 @@ def train(
                 f"{jax.process_count()}. Run it in one."
             )
         folder = scene_source.open_scene(scene or config.scene.path)
-        objects = checkpoint_io.load_scene(run)
-        if solved:
+        objects, log = checkpoint_io.load_scene(run), _Log(periods, progress, stop)
+        if model.config.splats is not None:
+            step = _train_splats(run, config, model.config, folder, checkpoints, log, mesh)
+        elif solved:
             step = backdrop_fit.solve(
                 run, config, model, objects, folder, checkpoints, progress, stop
             )
-            if step < total:
-                report(f"Stopped at iteration {step}.")
-            return step == total
-        sampler = read_pixels(config, folder, objects=objects if surface else None)
-        setup = loop.set_up(config, model.config, model.settings, objects, sampler, mesh=mesh)
-        _report_misses(setup, report)
-        begun = time.monotonic()
-        state = init_state(config.seed, model.config, config.schedule)
-        state = devices.put_everywhere(state, mesh=mesh)
-        if checkpoints.newest() is not None:
-            state = checkpoints.restore(state)
-        elif surface:
-            state = backdrop_fit.behind_field(
-                run, state, config, model, objects, folder, progress, stop
-            )
-        if devices.any_process(stop()):
-            raise KeyboardInterrupt  # there is no new state to save
-        # Of a run with fields alone, these are the seconds of its steps.
-        begun = begun if surface else time.monotonic()
-        step = _take_steps(run, setup, state, checkpoints, periods, progress, stop, begun)
+        else:
+            step = _train_field(run, config, model, objects, folder, checkpoints, log, report, mesh)
     if step < total:
-        report(f"Stopped at step {step}.")
+        report(f"Stopped at {'iteration' if solved else 'step'} {step}.")
     return step == total
+
+
+class _Log(NamedTuple):
+    """What `train` does between steps; see its arguments."""
+
+    periods: Periods
+    progress: Progress
+    stop: Callable[[], bool]
+
+
+def _train_field(
+    run: Path,
+    config: TrainConfig,
+    model: SavedModel,
+    objects: Scene,
+    folder: Path,
+    checkpoints: Checkpoints,
+    log: _Log,
+    report: Callable[[str], None],
+    mesh: Mesh | None,
+) -> int:
+    """Trains a field, and returns the number of the last step."""
+    surface = model.config.backdrop is not None
+    sampler = read_pixels(config, folder, objects=objects if surface else None)
+    setup = loop.set_up(config, model.config, model.settings, objects, sampler, mesh=mesh)
+    _report_misses(setup, report)
+    begun = time.monotonic()
+    state = init_state(config.seed, model.config, config.schedule)
+    state = devices.put_everywhere(state, mesh=mesh)
+    if checkpoints.newest() is not None:
+        state = checkpoints.restore(state)
+    elif surface:
+        state = backdrop_fit.behind_field(
+            run, state, config, model, objects, folder, log.progress, log.stop
+        )
+    if devices.any_process(log.stop()):
+        raise KeyboardInterrupt  # there is no new state to save
+    # Of a run with fields alone, these are the seconds of its steps.
+    begun = begun if surface else time.monotonic()
+    schedule = config.schedule
+    total, batch = require(schedule.steps), require(schedule.batch)
+    steps = _Steps(functools.partial(loop.run_steps, setup), total, batch)
+    return _take_steps(run, steps, state, checkpoints, log, begun)
+
+
+def _train_splats(
+    run: Path,
+    config: TrainConfig,
+    model: ModelConfig,
+    folder: Path,
+    checkpoints: Checkpoints,
+    log: _Log,
+    mesh: Mesh | None,
+) -> int:
+    """Trains Gaussian splats, and returns the number of the last step.
+
+    Raises:
+      ValueError: if there are several devices or processes.
+    """
+    if mesh is not None or jax.process_count() > 1:
+        raise ValueError(
+            "Gaussian splats (field=splats) train on one device in one process. Leave out the "
+            "others, or use another field."
+        )
+    state, steps = _splats(config, model, folder)
+    if checkpoints.newest() is not None:
+        state = checkpoints.restore(state)
+    if log.stop():
+        raise KeyboardInterrupt  # there is no new state to save
+    return _take_steps(run, steps, state, checkpoints, log, time.monotonic())
 
 
 def _report_misses(setup: loop.Setup, report: Callable[[str], None]) -> None:
@@ -327,30 +378,73 @@ def read_pixels(config: TrainConfig, scene: Path, *, objects: Scene | None = Non
     return PixelSampler(images, frames.cameras, seed=config.seed, batch=batch, kept=kept)
 
 
+class _Steps(NamedTuple):
+    """The steps of a run.
+
+    Attributes:
+      take: function of a state, the number of the last step, and periods (`every`), that yields
+        states and their reports, as `loop.run_steps` does.
+      total: number of steps of the run.
+      rays: number of rays per step.
+    """
+
+    take: Callable[..., Iterator[tuple[TrainState, Any]]]
+    total: int
+    rays: int
+
+
+def _splats(config: TrainConfig, model: ModelConfig, folder: Path) -> tuple[TrainState, _Steps]:
+    """Returns the initial state and the steps of Gaussian splats, of one training image each."""
+    from refref_jax.splats import gaussians, training  # costs nothing without splats
+
+    assert model.splats is not None
+    frames, total = scene_folder.read_frames(folder, "train"), require(config.schedule.steps)
+    targets, views = scene_folder.read_images(frames), frames.cameras
+    setup = training.set_up(
+        views,
+        targets,
+        seed=config.seed,
+        steps=total,
+        kernel=model.splats.kernel,
+        centre=model.centre,
+    )
+    begun = gaussians.start(config.seed, model.splats.gaussians, views, model.domain)
+
+    def as_state(state: training.State) -> TrainState:
+        return TrainState(state.step, Params((), state.gaussians), state.moments)
+
+    def take(
+        state: TrainState, until: int, *, every: Sequence[int]
+    ) -> Iterator[tuple[TrainState, training.Report]]:
+        first = training.State(state.step, state.params.field, state.optimizer)
+        for found, report in training.run_steps(setup, first, until, every=every):
+            yield as_state(found), report
+
+    return as_state(training.init_state(begun)), _Steps(take, total, views.height * views.width)
+
+
 def _take_steps(
     run: Path,
-    setup: loop.Setup,
+    steps: _Steps,
     state: TrainState,
     checkpoints: Checkpoints,
-    periods: Periods,
-    progress: Progress,
-    stop: Callable[[], bool],
+    log: _Log,
     begun: float,
 ) -> int:
     """Takes the remaining steps, and returns the number of the last; seconds count from `begun`."""
-    schedule = setup.config.schedule
-    total, batch, step = require(schedule.steps), require(schedule.batch), int(state.step)
+    periods, progress, stop = log
+    total, step = steps.total, int(state.step)
     writes = devices.is_first()
     earlier = run_folder.rewind_metrics(run, step) if writes else 0.0
     last, logged = time.monotonic(), step
     progress(step, total, "")
     every = (_MOST_STEPS, periods.log, periods.checkpoint)
-    for stepped, measured in loop.run_steps(setup, state, total, every=every):
+    for stepped, measured in steps.take(state, total, every=every):
         step = int(stepped.step)
         if step % periods.log == 0 or step == total:
             measured = jax.device_get(measured)
             now = time.monotonic()
-            rate = batch * (step - logged) / (now - last)
+            rate = steps.rays * (step - logged) / (now - last)
             line = _line(step, measured, rate, earlier + now - begun)
             if writes:
                 run_folder.append_metrics(run, line)
@@ -365,7 +459,7 @@ def _take_steps(
     return step
 
 
-def _line(step: int, measured: StepReport, rate: float, seconds: float) -> dict[str, Any]:
+def _line(step: int, measured: Any, rate: float, seconds: float) -> dict[str, Any]:
     """Returns a line of metrics.
 
     Raises:

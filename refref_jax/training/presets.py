@@ -33,28 +33,32 @@ with `small`, whose steps take 3.1 times as long. `paper` and `best` require a G
 differentials, so that footprints follow the bends, and four times as many rays per step, at the
 learning rate that Zip-NeRF uses for 65,536. It traces fewer batches at once, so that pre-traced
 batches have as many rays, and take as much memory, as those of `paper`.
+
+Of Gaussian splats, a preset has the number (20,000, 50,000, 500,000 and 1,000,000) and the steps,
+of one image each.
 """
 
 import dataclasses
-import math
 from typing import Any
 
 import numpy as np
 
-from refref_jax.choices import ORIGIN, InFront, Interior, Position, Space
+from refref_jax.choices import InFront, Interior, Paths
 from refref_jax.fields import hash_grid, msnerf, neus, registry
 from refref_jax.fields.base import RadianceConfig
 from refref_jax.fields.hash_grid import HashGridConfig
 from refref_jax.geometry.cameras import Cameras
-from refref_jax.render.model import BackdropConfig, ModelConfig, ProposalConfig
-from refref_jax.training.config import FieldConfig, LossConfig, ScheduleConfig, require
-
-_WALLS = 7.3
-"""Default half edge of the background cube, or radius of the background sphere: the data set's.
-
-Paths end there, on an opaque background, so the value must be exact: a cube that is 3 % too large
-costs 2.7 dB.
-"""
+from refref_jax.render.model import BackdropConfig, ModelConfig, ProposalConfig, SplatsConfig
+from refref_jax.sampling.scene_bounds import Bounds
+from refref_jax.training.config import (
+    BACKDROP_ONLY,
+    FIELD_ONLY,
+    FieldConfig,
+    LossConfig,
+    ScheduleConfig,
+    TrainConfig,
+    require,
+)
 
 BACKDROP_RESOLUTION = 384
 """Default number of cells per side of a face of a backdrop."""
@@ -62,15 +66,15 @@ BACKDROP_RESOLUTION = 384
 BACKDROP_ITERATIONS = 32
 """Default number of iterations of its solver."""
 
-_NEAR = 0.05
-_FAR_UNBOUNDED = 1000.0
+SPLATS = "splats"
+"""Name of the field kind of Gaussian splats, which have no field."""
 
-# World units per unit of the paper's released code (`--scale-factor 0.1`), whose near plane is
-# 0.05, and whose far plane is 15, or 1000 in unbounded scenes. It contracts space beyond one unit.
-_PUBLISHED_UNIT = 10.0
-_PUBLISHED_NEAR = 0.05 * _PUBLISHED_UNIT
-_PUBLISHED_FAR = 15.0 * _PUBLISHED_UNIT
-_PUBLISHED_FAR_UNBOUNDED = 1000.0 * _PUBLISHED_UNIT
+# Options of fields and light paths that Gaussian splats read, and others that they do not.
+_READ_BY_SPLATS = ("preset", "field", "steps", "gaussians", "splat_filter")
+_NOT_READ = (
+    *("rule", "ior", "shading", "pixels", "min_throughput", "max_bends", "reentry"),
+    *("interior", "tints", "tint_decay"),
+)
 
 # Radius of the ball of a surface, in distances of the nearest camera: 2.2 world units in the data
 # set, whose objects end at 2.1. In a larger ball, each camera could see a part of it by itself.
@@ -84,37 +88,30 @@ _BLURS = (0.03, 0.003)
 
 
 @dataclasses.dataclass(frozen=True)
-class Bounds:
-    """Bounds of a scene; see `ModelConfig`."""
-
-    near: float
-    far: float
-    radius: float
-    space: Space
-    centre: Position = ORIGIN
-
-
-@dataclasses.dataclass(frozen=True)
 class Preset:
     """One trade-off between speed and accuracy.
 
     Attributes:
       size: size of the fields, by its name in `fields.registry`.
       schedule: optimisation schedule.
+      gaussians: number of Gaussian splats.
     """
 
     size: str
     schedule: ScheduleConfig
+    gaussians: int
 
     def model(
         self, bounds_: Bounds, interior: Interior, *, field: str = registry.USUAL
     ) -> ModelConfig:
         """Returns the configuration of a model of a scene, with fields of a given type.
 
+        A model of Gaussian splats has the usual fields too, but does not read them.
+
         Raises:
           ValueError: if that field kind does not have this size.
         """
-        sizes = registry.KINDS[field].sizes
+        sizes = registry.KINDS[registry.USUAL if field == SPLATS else field].sizes
         if self.size not in sizes:
             raise ValueError(
                 f"Field kind {field} has no size {self.size}. Use one of the presets "
@@ -132,6 +129,7 @@ class Preset:
             learned_tints=0,
             dilation=size.dilation,
             last_sample="end",
+            splats=SplatsConfig(self.gaussians, "mip") if field == SPLATS else None,
             **dataclasses.asdict(bounds_),
         )
 
@@ -146,52 +144,6 @@ class Preset:
         if inside or model.space == "unbounded":
             return None
         return registry.KINDS[model.field.kind].sizes[self.size].background_samples
-
-
-def bounds(
-    cameras: Cameras, *, space: Space, radius: float | None, centre: Position = ORIGIN
-) -> Bounds:
-    """Returns the bounds of a scene.
-
-    A bounded scene extends from any camera to the farthest corner of its cube, a spherical scene to
-    the far side of its sphere. In an unbounded scene, the cameras and the space between them are
-    not contracted.
-
-    Args:
-      cameras: cameras of the training images.
-      space: geometry of the background: `bounded`, `spherical` or `unbounded`.
-      radius: radius instead of the default of `ModelConfig.radius`.
-      centre: centre of the background, world units.
-
-    Raises:
-      ValueError: if the radius is not positive and finite.
-    """
-    if radius is not None and not 0.0 < radius < math.inf:
-        raise ValueError(
-            f"radius is {radius}, but it is a length. Give a positive number of world units."
-        )
-    farthest = float(np.max(np.linalg.norm(cameras.poses[:, :, 3] - centre, axis=-1)))
-    if space == "unbounded":
-        return Bounds(_NEAR, _FAR_UNBOUNDED, radius or 1.25 * farthest, space, centre)
-    radius = radius or _WALLS
-    reach = radius if space == "spherical" else math.sqrt(3.0) * radius
-    return Bounds(_NEAR, farthest + reach, radius, space, centre)
-
-
-def contracted(scene: Bounds, *, radius: float | None) -> Bounds:
-    """Returns bounds that ignore the size of the background: space is contracted around its centre.
-
-    Args:
-      scene: bounds of the scene.
-      radius: radius of an unbounded scene's uncontracted ball, world units; by default, and in
-        other scenes, that of the released code.
-
-    Source: the paper's released code, in world units.
-    """
-    if scene.space == "unbounded":
-        ball = radius or _PUBLISHED_UNIT
-        return Bounds(_PUBLISHED_NEAR, _PUBLISHED_FAR_UNBOUNDED, ball, "unbounded", scene.centre)
-    return Bounds(_PUBLISHED_NEAR, _PUBLISHED_FAR, _PUBLISHED_UNIT, "unbounded", scene.centre)
 
 
 def place_surface(model: ModelConfig, cameras: Cameras) -> ModelConfig:
@@ -253,6 +205,11 @@ def override_model(
         model = _with_samples(model, asked.samples_per_ray, asked.preset)
     names = ("multisamples", "footprint", "dilation")
     given = {name: getattr(asked, name) for name in names}
+    if model.splats is not None:
+        count, kernel = asked.gaussians, asked.splat_filter
+        given["splats"] = SplatsConfig(
+            count or model.splats.gaussians, kernel or model.splats.kernel
+        )
     if asked.exposure == "per_image" and in_front == "field":
         raise ValueError(
             "exposure=per_image, but this scene needs a field in front of its backdrop, and a "
@@ -330,6 +287,48 @@ def _with_sub_spaces(field: RadianceConfig, count: int | None) -> RadianceConfig
     return dataclasses.replace(field, sub_spaces=count)
 
 
+def usual_paths(field: str, parts: int) -> tuple[Paths, str]:
+    """Returns the light paths of a scene with some number of parts, and the reason for them."""
+    if field == SPLATS:
+        return "straight", "Gaussian splats have no light paths"
+    return ("tree", "there are meshes") if parts else ("straight", "there are no meshes")
+
+
+def check_splats(config: TrainConfig) -> None:
+    """Refuses overrides that have no effect on Gaussian splats, or only on them.
+
+    Raises:
+      ValueError: if there is one.
+    """
+    given = config.overrides()
+    if config.model.field != SPLATS:
+        if ignored := sorted(given & {"gaussians", "splat_filter"}):
+            raise ValueError(
+                f"{' and '.join(ignored)} have no effect on fields of kind {config.model.field}. "
+                "Leave them out, or use field=splats."
+            )
+        return
+    ignored = [name for name in unread_by_splats(config) if name in given]
+    wrong = {
+        "paths": (config.paths.name, "straight"),
+        "far_field": (config.model.far_field, "field"),
+    }
+    ignored += [f"{n}={x}" for n, (x, usual) in wrong.items() if n in given and x != usual]
+    if ignored:
+        raise ValueError(
+            f"No effect on Gaussian splats, which have neither light paths nor a field: "
+            f"{', '.join(ignored)}. Leave them out, or use another field, such as field=zipnerf."
+        )
+
+
+def unread_by_splats(config: TrainConfig) -> list[str]:
+    """Returns the options that have no effect on Gaussian splats; none for other fields."""
+    if config.model.field != SPLATS:
+        return []
+    names = (*FIELD_ONLY, *BACKDROP_ONLY, *_NOT_READ)
+    return [name for name in names if name not in _READ_BY_SPLATS]
+
+
 def samples_of(model: ModelConfig) -> tuple[int, ...]:
     """Returns the number of samples of each proposal level, then of the radiance field."""
     return (*(proposal.samples for proposal in model.proposals), model.samples)
@@ -352,6 +351,8 @@ def sampling_of(model: ModelConfig) -> dict[str, Any]:
         "precision": model.field.precision,
         "dilation": model.dilation,
         "sub_spaces": field.sub_spaces if isinstance(field, msnerf.MsnerfConfig) else None,
+        "gaussians": model.splats and model.splats.gaussians,
+        "splat_filter": model.splats and model.splats.kernel,
     }
 
 
@@ -421,6 +422,7 @@ PRESETS = {
             batch=1024,
             pretraced_batches=32,
         ),
+        gaussians=20_000,
     ),
     "small": Preset(
         size="small",
@@ -433,6 +435,7 @@ PRESETS = {
             batch=2048,
             pretraced_batches=32,
         ),
+        gaussians=50_000,
     ),
     "paper": Preset(
         size="paper",
@@ -445,6 +448,7 @@ PRESETS = {
             batch=4096,
             pretraced_batches=32,
         ),
+        gaussians=500_000,
     ),
     "best": Preset(
         size="best",
@@ -457,6 +461,7 @@ PRESETS = {
             batch=16_384,
             pretraced_batches=8,
         ),
+        gaussians=1_000_000,
     ),
 }
 

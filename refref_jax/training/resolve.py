@@ -43,6 +43,7 @@ from refref_jax.optics.path_settings import PathSettings, make_path_settings
 from refref_jax.optics.scene import Scene
 from refref_jax.render.checkpoint_io import SavedModel
 from refref_jax.render.model import ModelConfig, has_foreground
+from refref_jax.sampling import scene_bounds
 from refref_jax.training import presets
 from refref_jax.training.config import (
     BACKDROP_ONLY,
@@ -114,6 +115,7 @@ class Resolved(NamedTuple):
         model = self.model.config
         surface = model.backdrop is not None and not has_foreground(model)
         unread = {n for n in FIELD_ONLY if surface and self.reasons.get(n) != _GIVEN}
+        unread.update(presets.unread_by_splats(self.config))
         used = {n: x for n, x in values.items() if n not in unread}
         shown = {n: x for n, x in used.items() if x not in (None, (), "", choices.ORIGIN)}
         lines = configuration.describe(shown, self.reasons)
@@ -178,8 +180,8 @@ def resolve(config: TrainConfig, facts: SceneFacts) -> Resolved:
     Raises:
       ValueError: if overrides contradict each other or the scene.
     """
-    asked, found = config, facts.analysis
-    reasons = _first_reasons(config)
+    presets.check_splats(config)
+    asked, found, reasons = config, facts.analysis, _first_reasons(config)
     config = _decide(config, reasons, facts.origins.get("rule", _USUAL), rule=facts.rule)
     settings, config = _resolve_paths(config, found, reasons)
     config = _resolve_inside(config, found, settings, reasons)
@@ -188,8 +190,7 @@ def resolve(config: TrainConfig, facts: SceneFacts) -> Resolved:
         settings = dataclasses.replace(settings, reentry=require(config.paths.reentry))
     config = _resolve_training(config, model, reasons)
     check_batch(facts.cameras, require(config.schedule.batch))
-    warnings = tuple(_warnings(asked, config, facts))
-    return Resolved(config, SavedModel(model, settings), reasons, warnings)
+    return Resolved(config, SavedModel(model, settings), reasons, _warnings(asked, config, facts))
 
 
 def build_scene(resolved: Resolved, facts: SceneFacts) -> Scene:
@@ -206,8 +207,7 @@ def build_scene(resolved: Resolved, facts: SceneFacts) -> Scene:
 
 
 def _first_reasons(config: TrainConfig) -> dict[str, str]:
-    usual, overrides = TrainConfig(), config.overrides()
-    reasons = {}
+    usual, overrides, reasons = TrainConfig(), config.overrides(), {}
     for option in options_of():
         decided = option.field.default is None and option.name not in overrides
         same = config.get(option.name) == usual.get(option.name)
@@ -234,7 +234,7 @@ def _resolve_paths(
             f"There are no meshes that could bend light for paths={config.paths.name}."
             " Add .ply files of the objects to the scene's folder meshes, or use paths=straight."
         )
-    name, why = ("tree", "there are meshes") if found.parts else ("straight", "there are no meshes")
+    name, why = presets.usual_paths(config.model.field, found.parts)
     config = _decide(config, reasons, why, paths=name)
     paths = config.paths
     settings = make_path_settings(
@@ -369,6 +369,7 @@ def _resolve_far_field(
 def _needs_of_a_field(config: TrainConfig, facts: SceneFacts) -> list[str]:
     """Returns what a backdrop cannot model, even with a field in front of it."""
     needs = {
+        "Gaussian splats (field=splats)": config.model.field == presets.SPLATS,
         "straight rays (paths=straight)": facts.analysis.parts > 0 and not config.paths.max_bends,
         "contraction=always": config.model.contraction == "always",
         "a surface (field=neus or unisurf)": registry.KINDS[config.model.field].depth is not None,
@@ -422,7 +423,7 @@ def _share_of_misfits(config: TrainConfig, facts: SceneFacts) -> float:
 
 def _resolve_bounds(
     config: TrainConfig, facts: SceneFacts, reasons: dict[str, str]
-) -> tuple[presets.Bounds, TrainConfig]:
+) -> tuple[scene_bounds.Bounds, TrainConfig]:
     """Decides the size of the background, and the near and far planes.
 
     Raises:
@@ -432,13 +433,11 @@ def _resolve_bounds(
     config = _decide(config, reasons, "the scene", background=space)
     why = facts.source if facts.half_extent else "the data set's usual background"
     why = "the cameras" if space == "unbounded" else why
-    centre = config.scene.centre or facts.centre
-    extent = presets.bounds(
-        facts.cameras, space=space, radius=size or facts.half_extent, centre=centre
-    )
+    half, centre = size or facts.half_extent, config.scene.centre or facts.centre
+    extent = scene_bounds.bounds(facts.cameras, space=space, radius=half, centre=centre)
     sampled, reason = extent, f"background={space}"
     if config.model.contraction == "always":
-        sampled, reason = presets.contracted(extent, radius=size), "contraction=always"
+        sampled, reason = scene_bounds.contracted(extent, radius=size), "contraction=always"
         if space == "unbounded":
             extent, why = sampled, reason
     far = config.model.far
@@ -474,7 +473,7 @@ def _resolve_training(
     return config
 
 
-def _warnings(asked: TrainConfig, config: TrainConfig, facts: SceneFacts) -> list[str]:
+def _warnings(asked: TrainConfig, config: TrainConfig, facts: SceneFacts) -> tuple[str, ...]:
     warnings, found, given = [], facts.analysis, asked.overrides()
     ignored = [name for name in FIELD_ONLY if name in given]
     asks = config.model.far_field == "backdrop" and given & {"far_field", *BACKDROP_ONLY}
@@ -498,4 +497,4 @@ def _warnings(asked: TrainConfig, config: TrainConfig, facts: SceneFacts) -> lis
             "reentry=impossible, but light that has left these objects may meet them again; "
             "such light will not be traced any further. Leave it out."
         )
-    return warnings
+    return tuple(warnings)

@@ -305,7 +305,7 @@ def test_names_of_what_can_be_chosen_are_those_that_exist():
     assert tuple(presets.PRESETS) == get_args(choices.PresetName)
     assert get_args(choices.Split) == scene_folder.SPLITS
     names = (registry.USUAL, *(x for x in registry.KINDS if x != registry.USUAL))
-    assert names == get_args(choices.FieldName)
+    assert (*names, presets.SPLATS) == get_args(choices.FieldName)
     assert tuple(RULES) == get_args(choices.RuleName)
     assert tuple(PATH_PRESETS) == get_args(choices.Paths)
     assert tuple(GEOMETRIES) == r3f_flags.GEOMETRIES

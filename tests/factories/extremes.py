@@ -11,9 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from refref_jax.fields.hash_grid import HashGridConfig
-from refref_jax.optics.light_paths import PathStatus
+from refref_jax.optics.light_paths import PathStatus, RayDifferential
 from refref_jax.optics.path_tracing import Traced
-from refref_jax.optics.ray_differentials import RayDifferential
 from refref_jax.render.model import init_params
 from tests.factories import made_paths, small_model
 

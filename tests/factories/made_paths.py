@@ -4,8 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from refref_jax.optics.light_paths import LightPaths, PathStatus
-from refref_jax.optics.ray_differentials import RayDifferential
+from refref_jax.optics.light_paths import LightPaths, PathStatus, RayDifferential
 
 
 def path(

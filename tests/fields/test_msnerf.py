@@ -10,8 +10,9 @@ import pytest
 from refref_jax.fields import hash_grid, msnerf, registry, zipnerf
 from refref_jax.fields.hash_grid import HashGridConfig
 from refref_jax.sampling.polylines import Gaussians
+from refref_jax.sampling.scene_bounds import Bounds
 from refref_jax.training.config import FieldConfig
-from refref_jax.training.presets import PRESETS, Bounds, override_model, sampling_of
+from refref_jax.training.presets import PRESETS, override_model, sampling_of
 from tests.laws import gradients
 
 _GRID = HashGridConfig(levels=2, base_res=3, max_res=10, hashmap_size=256, features=2)

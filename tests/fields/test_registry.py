@@ -17,8 +17,9 @@ from refref_jax.render import checkpoint_io
 from refref_jax.render.checkpoint_io import SavedModel
 from refref_jax.render.images import render_rays
 from refref_jax.render.model import Model, init_params
+from refref_jax.sampling.scene_bounds import Bounds
 from refref_jax.training.config import FieldConfig
-from refref_jax.training.presets import PRESETS, Bounds, loss, override_model, samples_of
+from refref_jax.training.presets import PRESETS, loss, override_model, samples_of
 from tests.factories import scenes, small_model
 
 _BOUNDS = Bounds(near=0.05, far=16.0, radius=7.3, space="bounded")

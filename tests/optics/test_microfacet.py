@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from refref_jax.optics import microfacet
+from refref_jax.optics import fresnel
 
 _UP = jnp.array([0.0, 0.0, 1.0])
 
@@ -17,8 +17,8 @@ def _facets(direction, alpha, count=40_000, seed=0, normal=_UP):
     @jax.jit
     @jax.vmap
     def facet(point):
-        numbers = microfacet.uniform_pair(point, direction)
-        return microfacet.facet_normal(direction, normal, jnp.float32(alpha), numbers)
+        numbers = fresnel.uniform_pair(point, direction)
+        return fresnel.facet_normal(direction, normal, jnp.float32(alpha), numbers)
 
     return np.asarray(facet(jnp.asarray(points)), np.float64)
 
@@ -67,7 +67,7 @@ def test_facets_have_the_distribution_of_visible_normals(degrees, alpha):
 def test_masking_equals_the_formula_of_two_lambdas(alpha):
     cosines = np.linspace(0.02, 1.0, 25)
     towards, leaving = np.meshgrid(cosines, cosines)
-    found = jnp.vectorize(microfacet.masking)(
+    found = jnp.vectorize(fresnel.masking)(
         towards.astype(np.float32), leaving.astype(np.float32), np.float32(alpha)
     )
     one, other = (1.0 / _visible(x, alpha) - 1.0 for x in (towards, leaving))
@@ -79,7 +79,7 @@ def test_masking_at_the_extremes_is_finite_with_finite_gradients():
         for leaving in (-1.0, -1e-9, 0.0, 1e-20, 1e-6, 1.0):
             for alpha in (0.0, 1e-8, 1.0):
                 args = tuple(map(jnp.float32, (towards, leaving, alpha)))
-                value, slopes = jax.value_and_grad(microfacet.masking, argnums=(0, 1, 2))(*args)
+                value, slopes = jax.value_and_grad(fresnel.masking, argnums=(0, 1, 2))(*args)
                 assert 0.0 <= value <= 1.0 and (leaving > 0.0 or value == 0.0)
                 assert np.all(np.isfinite(slopes))
 
@@ -92,7 +92,7 @@ def test_a_smooth_surface_has_its_own_normal():
 def test_a_ray_always_meets_the_same_facet_and_neighbours_another():
     assert np.array_equal(_facets(_UP * -1.0, 0.3), _facets(_UP * -1.0, 0.3))
     near = jnp.array([[1.0, 2.0, 3.0], [1.0 + 2e-7, 2.0, 3.0]], jnp.float32)
-    pairs = jax.vmap(microfacet.uniform_pair, in_axes=(0, None))(near, -_UP)
+    pairs = jax.vmap(fresnel.uniform_pair, in_axes=(0, None))(near, -_UP)
     assert all(abs(float(one - other)) > 1e-3 for one, other in pairs)
 
 
@@ -102,9 +102,9 @@ def test_the_rays_of_a_pixel_share_the_numbers_evenly_at_their_first_bends():
         """Returns how much the mean of a function over 64 rays varies between pixels."""
 
         def value(pixel, ray):
-            stratum = microfacet.Stratum(pixel, ray, jnp.int32(64), bends)
+            stratum = fresnel.Stratum(pixel, ray, jnp.int32(64), bends)
             hit = jnp.stack([pixel, ray, bends]).astype(jnp.float32)
-            u, v = microfacet.uniform_pair(hit, -_UP, stratum=stratum)
+            u, v = fresnel.uniform_pair(hit, -_UP, stratum=stratum)
             return jnp.sin(2.0 * jnp.pi * u) + jnp.cos(2.0 * jnp.pi * v)
 
         rays, pixels = jnp.arange(64, dtype=jnp.int32), jnp.arange(300, dtype=jnp.int32)
@@ -119,8 +119,8 @@ def test_the_rays_of_a_pixel_share_the_numbers_evenly_at_their_first_bends():
 @pytest.mark.parametrize("degrees", [0.0, 60.0, 90.0])
 def test_gradients_of_a_facet_are_finite(degrees):
     def facet(direction, alpha):
-        numbers = microfacet.uniform_pair(jnp.ones(3), direction)
-        return microfacet.facet_normal(direction, _UP, alpha, numbers)
+        numbers = fresnel.uniform_pair(jnp.ones(3), direction)
+        return fresnel.facet_normal(direction, _UP, alpha, numbers)
 
     for alpha in (0.0, 1e-6, 0.3):
         slopes = jax.jacfwd(facet, argnums=(0, 1))(_incident(degrees), jnp.float32(alpha))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from refref_jax.geometry.rays import orthonormal_basis
-from refref_jax.optics import path_tracing, ray_differentials
+from refref_jax.optics import light_paths, path_tracing
 from refref_jax.optics.differentiable_paths import follow_branch
 from refref_jax.optics.light_paths import exists, straight
 from refref_jax.optics.path_settings import TREE, Detail, PathSettings
@@ -126,7 +126,7 @@ def test_spreads_are_finite_at_grazing_and_critical_angles(index):
 
 
 def test_nothing_is_carried_for_a_cone():
-    differential = ray_differentials.begin(
+    differential = light_paths.begin_differential(
         jax.tree.map(lambda x: x[0], scenes.rays([0, 0, 0], [0, 0, 1])), "cone"
     )
     assert differential.points.size == 0 and differential.directions.size == 0

@@ -12,7 +12,7 @@ import trimesh
 
 from refref_jax.data import scene_folder
 from refref_jax.geometry.cameras import image_rays
-from refref_jax.render import Model, one_ray, render_image, render_rays
+from refref_jax.render import Model, pixels, render_image, render_rays
 from refref_jax.render.model import look_up
 from refref_jax.training import backdrop_solver, run_folder
 from refref_jax.training.config import TrainConfig
@@ -129,7 +129,7 @@ def test_a_model_with_a_backdrop_has_no_field_to_look_up(run):
     with pytest.raises(ValueError, match="no density to look up"):
         look_up(model.params, model.config, jnp.zeros(3), jnp.array([0.0, 0.0, 1.0]), width=0.1)
     with pytest.raises(ValueError, match="the model has a backdrop"):
-        one_ray.render_ray(model, jax.tree.map(lambda x: x[0, 0], image_rays(CAMERAS, 0)))
+        pixels.render_ray(model, jax.tree.map(lambda x: x[0, 0], image_rays(CAMERAS, 0)))
 
 
 def _after_a_round(run):

@@ -6,7 +6,8 @@ import json
 import pytest
 
 from refref_jax.geometry.cameras import orbit
-from refref_jax.training.presets import PRESETS, Bounds, bounds, contracted, loss
+from refref_jax.sampling.scene_bounds import Bounds, bounds, contracted
+from refref_jax.training.presets import PRESETS, loss
 
 pytestmark = pytest.mark.loose
 

@@ -24,6 +24,7 @@ from refref_jax.optics.path_settings import (
     make_path_settings,
 )
 from refref_jax.render import checkpoint_io
+from refref_jax.sampling.scene_bounds import Bounds
 from refref_jax.training import config_files, run_folder
 from refref_jax.training.config import (
     BACKDROP_ONLY,
@@ -35,7 +36,7 @@ from refref_jax.training.config import (
     options_of,
 )
 from refref_jax.training.fit import prepare
-from refref_jax.training.presets import Bounds, override_model, samples_of
+from refref_jax.training.presets import override_model, samples_of
 from refref_jax.training.resolve import SceneFacts, build_scene, resolve
 from tests.factories.small_model import CAMERAS, MODEL
 from tests.processes.command import ROOT
@@ -94,7 +95,8 @@ def test_resolve_leaves_nothing_open_and_is_idempotent(found, given):
     straight = made.model.settings.max_bends == 0
     for option in options_of():
         left = straight and option.name == "reentry"
-        left |= option.name in (*BACKDROP_ONLY, "sub_spaces", "eikonal_weight", "curvature_weight")
+        unused = ("sub_spaces", "eikonal_weight", "curvature_weight", "gaussians", "splat_filter")
+        left |= option.name in (*BACKDROP_ONLY, *unused)
         assert left == (made.config.get(option.name) is None), option.name
         assert made.reasons[option.name]
     again = resolve(made.config, SceneFacts(found, CAMERAS, (), None, None, ()))

@@ -63,6 +63,7 @@ def test_methods_are_in_the_order_of_the_table_and_none_hides_a_reconstruction()
         ("msnerf", ()),
         ("neus", ("walls",)),
         ("unisurf", ("walls",)),
+        ("splats", ()),
     ]
     for group in ("main", "ablations"):
         names = {each.name for each in methods.parse([group])}

@@ -1,0 +1,1 @@
+"""3D Gaussian splats: their projection, a differentiable rasterizer, images, and their training."""
