@@ -36,7 +36,6 @@ from refref_jax.data.meshes import MeshPart
 from refref_jax.data.scene_analysis import SceneAnalysis
 from refref_jax.data.scene_assembly import assemble_scene
 from refref_jax.data.scene_properties import SceneProperties
-from refref_jax.fields import registry
 from refref_jax.geometry.cameras import Cameras
 from refref_jax.optics.media import INDEX_OF_AIR
 from refref_jax.optics.path_settings import PathSettings, make_path_settings
@@ -372,7 +371,7 @@ def _needs_of_a_field(config: TrainConfig, facts: SceneFacts) -> list[str]:
         "Gaussian splats (field=splats)": config.model.field == presets.SPLATS,
         "straight rays (paths=straight)": facts.analysis.parts > 0 and not config.paths.max_bends,
         "contraction=always": config.model.contraction == "always",
-        "a surface (field=neus or unisurf)": registry.KINDS[config.model.field].depth is not None,
+        "a surface (field=neus or unisurf)": config.model.field in ("neus", "unisurf"),
     }
     return [name for name, holds in needs.items() if holds]
 

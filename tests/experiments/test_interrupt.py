@@ -47,7 +47,7 @@ def test_before_its_first_step_a_training_ends_with_nothing_saved(tmp_path, monk
         scene=types.SimpleNamespace(path="scene"),
         settings=types.SimpleNamespace(bends=1),
         model=types.SimpleNamespace(far_field="field"),
-        config=types.SimpleNamespace(backdrop=None),
+        config=types.SimpleNamespace(backdrop=None, splats=None),
         seed=0,
     )
     for module, name in (
