@@ -2,12 +2,12 @@
 
 import os
 import signal
-import types
 
 import pytest
 
 from experiments.cli import app
 from refref_jax.training import fit
+from refref_jax.training.config import TrainConfig
 
 pytestmark = pytest.mark.loose
 
@@ -37,33 +37,20 @@ def test_the_signals_are_given_back_after_an_error():
     assert [signal.getsignal(each) for each in _SIGNALS] == before
 
 
-def test_before_its_first_step_a_training_ends_with_nothing_saved(tmp_path, monkeypatch, capfd):
-    def set_up(*arguments, **options):
-        os.kill(os.getpid(), signal.SIGINT)
-        return types.SimpleNamespace(hit_fraction=1.0)
+def test_before_its_first_step_a_training_ends_with_nothing_saved(
+    ball_scene, tmp_path, monkeypatch, capfd
+):
+    set_up = fit.loop.set_up
 
-    known = types.SimpleNamespace(
-        schedule=types.SimpleNamespace(steps=5),
-        scene=types.SimpleNamespace(path="scene"),
-        settings=types.SimpleNamespace(bends=1),
-        model=types.SimpleNamespace(far_field="field"),
-        config=types.SimpleNamespace(backdrop=None, splats=None),
-        seed=0,
-    )
-    for module, name in (
-        (fit.run_folder, "read_config"),
-        (fit.checkpoint_io, "read_static"),
-        (fit.checkpoint_io, "load_scene"),
-        (fit.scene_source, "open_scene"),
-        (fit, "read_pixels"),
-        (fit, "_report_misses"),
-        (fit, "init_state"),
-        (fit.devices, "put_everywhere"),
-    ):
-        monkeypatch.setattr(module, name, lambda *arguments, **options: known)
-    monkeypatch.setattr(fit.loop, "set_up", set_up)
+    def interrupted(*arguments, **options):
+        os.kill(os.getpid(), signal.SIGINT)
+        return set_up(*arguments, **options)
+
+    monkeypatch.setattr(fit.loop, "set_up", interrupted)
     monkeypatch.setattr(fit, "_take_steps", lambda *arguments: pytest.fail("it has begun"))
+    options = {"scene": str(ball_scene), "paths": "straight", "far_field": "field", "batch": 64}
+    config = TrainConfig().override(**options, steps=5)
     with pytest.raises(KeyboardInterrupt), app.Interrupt() as interrupt:
-        fit.train(tmp_path, stop=lambda: interrupt.requested)
+        fit.fit(config, out=tmp_path / "run", stop=lambda: interrupt.requested)
     assert "Stopping after this step" in capfd.readouterr().out
-    assert not any((tmp_path / "checkpoints").iterdir())
+    assert not any((tmp_path / "run" / "checkpoints").iterdir())
