@@ -231,6 +231,7 @@ def test_a_cell_is_as_wide_as_the_median_pixel():
     assert backdrop_trial.resolution_of(wide, 256) == 64
 
 
+@pytest.mark.slow
 def test_a_trial_times_each_part_of_a_training(tmp_path):
     scene = cut_ball(tmp_path / "cube_smcvx_ball")
     resolved, objects = far_fields.prepare(scene, {})

@@ -134,7 +134,16 @@ def test_packets_and_lockstep_give_the_same_hits(count):
     np.testing.assert_allclose(packets[2], lockstep[2], atol=2e-5)
 
 
-@pytest.mark.parametrize("faces", [0, 1, 12, 300, 1500])
+@pytest.mark.parametrize(
+    "faces",
+    [
+        0,
+        1,
+        12,
+        pytest.param(300, marks=pytest.mark.slow),
+        pytest.param(1500, marks=pytest.mark.slow),
+    ],
+)
 def test_spare_rows_change_no_hit(faces):
     tree, slots = bvh_build.build(_soup(faces).astype(np.float32))
     filled = bvh_build.filled_up(tree)

@@ -211,7 +211,7 @@ def test_a_rough_surface_adds_no_light_and_scatters_around_the_mirror(roughness)
     assert abs(np.mean(sideways)) < 0.05 and 0.1 < spread / roughness**2 < 6.0
 
 
-@pytest.mark.parametrize("number", [4, 64])
+@pytest.mark.parametrize("number", [pytest.param(4, marks=pytest.mark.slow), 64])
 def test_the_footprint_behind_a_rough_surface_reaches_the_next_facet(number):
     rough = Material("conductor", roughness=0.3, complex_index=_GOLD)
     rays = _rays(0.0)._replace(strata=jnp.array([[0, 0, number]], jnp.int32))
@@ -261,6 +261,7 @@ def test_each_channel_of_a_rough_prism_meets_the_facets_of_its_stratum(channel):
     _assert_same_paths(_paths(of_channel(both, channel), rays), _paths(one, rays))
 
 
+@pytest.mark.slow
 def test_interior_lists_leave_the_facets_of_a_stratum_as_they_are():
     rough = Material(roughness=0.2)
     outer = _BALL._replace(material=rough)

@@ -248,7 +248,7 @@ def test_accelerators_cast_all_rays_at_once_into_lists_of_the_same_size(monkeypa
     np.testing.assert_allclose(*found, rtol=1e-5)
 
 
-@pytest.mark.parametrize("segments_per_ray", [2.0, 90.0])
+@pytest.mark.parametrize("segments_per_ray", [pytest.param(2.0, marks=pytest.mark.slow), 90.0])
 def test_last_segments_are_the_same_if_others_are_not_stored(segments_per_ray):
     scene, rays = scenes.build(scenes.box((1.0, 1.2, 1.4))), _towards_a_ball(32)
     settings = dataclasses.replace(_generous(TREE), max_bends=4, segments_per_ray=segments_per_ray)

@@ -197,10 +197,8 @@ def small_tiles():
         yield
 
 
-@pytest.mark.longest
-@pytest.mark.parametrize(
-    "bubbles", [[_ONE], pytest.param([_ONE, _TWO], marks=pytest.mark.slow)], ids=["one", "two"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("bubbles", [[_ONE], [_ONE, _TWO]], ids=["one", "two"])
 def test_bubbles_are_found(world, bubbles):
     pixels, judges = _seen(world, bubbles)
     solid, told = _solid(world, pixels, judges), []

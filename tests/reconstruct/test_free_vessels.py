@@ -86,6 +86,7 @@ def test_what_it_cannot_be_is_refused(mesh, inside, interior, message):
         FreeVessel(mesh, interior, inside)
 
 
+@pytest.mark.slow
 def test_light_finds_thickness_and_tint(mesh, inside, monkeypatch):
     monkeypatch.setattr(photometry, "_TILE", 1024)
     surface, tint = vessels.smooth_backdrop(), (0.9, 0.97, 0.85)

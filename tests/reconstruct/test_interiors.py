@@ -103,7 +103,8 @@ def test_the_number_of_faces_does_not_depend_on_the_level(body):
     assert len(counts) == 1
 
 
-@pytest.mark.parametrize("deviation", [pytest.param(0.0, marks=pytest.mark.slow), 0.03])
+@pytest.mark.slow
+@pytest.mark.parametrize("deviation", [0.0, 0.03])
 def test_a_given_index_is_kept(body, surface, small_tiles, deviation):
     del small_tiles
     seen = vessels.photographs(Vessel(body, Interior("air", wall=0.15), _SMALL), surface)
@@ -219,6 +220,7 @@ def test_a_look_finds_the_tint_and_prefers_the_truth(body, surface, photographs)
     assert all(each.error > 2.0 * best.error for each in worse)
 
 
+@pytest.mark.slow
 def test_level_index_and_tint_are_recovered(body, surface, photographs):
     start = dataclasses.replace(_FLASK, level=-0.18, gap=0.09, liquid=1.35, tint=(0.55, 0.8, 0.92))
     vessel = Vessel(body, start, _SMALL)

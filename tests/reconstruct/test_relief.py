@@ -149,6 +149,7 @@ def test_parts_of_a_vessel_with_a_relief_are_closed_and_nested(relief):
         np.testing.assert_array_equal(liquid.vertices[:, 2], plain.vertices[:, 2])
 
 
+@pytest.mark.slow
 def test_outlines_decide_about_the_relief():
     cameras = bodies.cameras_around(24, size=120, distance=3.0)
     angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 200)

@@ -25,12 +25,12 @@ _SCENES = {
 }
 
 
-# The path tree has the most paths to render one by one, uncompiled.
-_SLOW = "glass ball, path tree"
+# The most paths to render one by one, uncompiled.
+_SLOW = ("glass ball, path tree", "water in glass, learned tints")
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name == _SLOW)) for name in _SCENES]
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in _SLOW)) for name in _SCENES]
 )
 def test_render_ray_equals_render_rays(name):
     config, settings, parts = _SCENES[name]

@@ -186,6 +186,7 @@ def filled(scene, tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_a_field_on_opaque_parts_is_trained_in_front_of_the_backdrop(filled, tmp_path):
     options = {"backdrop_resolution": 64, "iterations": _ROUND}
     config = TrainConfig().override(scene=str(filled), **options)

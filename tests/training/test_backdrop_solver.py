@@ -266,6 +266,7 @@ def test_a_black_image_leaves_all_gains_finite():
     assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(last[:4]))
 
 
+@pytest.mark.slow
 def test_rounds_with_other_pixels_come_close_to_all_pixels(ball):
     views, sky = _views(10, 32), _environment()
     images = _photographs(ball, sky, views, _TREE)

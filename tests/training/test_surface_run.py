@@ -149,7 +149,7 @@ def _config(**changes):
     return TrainConfig().override(scene=str(_SCENE), pretraced_batches=4, **small, **given)
 
 
-@pytest.fixture(scope="module", params=["neus", "unisurf"])
+@pytest.fixture(scope="module", params=["neus", pytest.param("unisurf", marks=pytest.mark.slow)])
 def trained(request, tmp_path_factory):
     """A model, and the folder of its run."""
     run = tmp_path_factory.mktemp(request.param) / "run"

@@ -574,7 +574,8 @@ def test_a_folder_that_was_killed_while_it_was_opened_is_taken(scene, tmp_path):
     assert records.begin(out, asked) == asked == records.read(out)
 
 
-@pytest.mark.parametrize("outliers", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("outliers", [0, 1])
 def test_a_wrong_mask_is_named_unless_one_may_be_wrong(scene, tmp_path, outliers):
     spoilt = shutil.copytree(scene, tmp_path / scene.name)
     wrong = scene_folder.read_frames(spoilt, "train").masks[5]
