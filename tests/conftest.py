@@ -1,4 +1,5 @@
 import atexit
+import gc
 import os
 import shutil
 import tempfile
@@ -18,6 +19,9 @@ os.environ["XLA_FLAGS"] = code_generator.faster(os.environ.get("XLA_FLAGS", ""))
 
 import jax
 import pytest
+
+# Traced programs are millions of objects: to look for garbage among them took a tenth of the time.
+gc.set_threshold(100_000, 10, 10)
 
 # A silent broadcast between different ranks is a bug.
 jax.config.update("jax_numpy_rank_promotion", "raise")
