@@ -61,7 +61,7 @@ class Kernel(NamedTuple):
       opcode: operation.
       bytes: size of operands and results.
       shape: text of its result's shape.
-      scope: where it comes from, as in `Instruction`.
+      scope: origin in the traced program, as in `Instruction`.
     """
 
     loops: tuple[str, ...]

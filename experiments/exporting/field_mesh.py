@@ -88,9 +88,8 @@ def sample_density(
     Returns:
       Density per world unit at the grid's points, 0 inside objects that are not sampled.
     """
-    spacing = float((high - low).max()) / resolution
-    counts = np.maximum(np.rint((high - low) / spacing), 1).astype(np.int64) + 1
-    axes = [low[i] + spacing * np.arange(counts[i]) for i in range(3)]
+    spacing, axes = _axes(low, high, resolution)
+    counts = [len(axis) for axis in axes]
     unknown = np.zeros(counts, bool)
     if model.config.interior != "field":
         unknown = inside_objects(model.scene, axes)
@@ -100,8 +99,17 @@ def sample_density(
         points = np.stack([np.full(len(rows), x), axes[1][rows[:, 0]], axes[2][rows[:, 1]]], -1)
         density, _ = look_up_points(model, points, None, width=spacing)
         values[i, rows[:, 0], rows[:, 1]] = density
-        step(i + 1, int(counts[0]))
+        step(i + 1, counts[0])
     return Grid(values, low, spacing)
+
+
+def _axes(
+    low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], resolution: int
+) -> tuple[float, list[Float[np.ndarray, " ticks"]]]:
+    """Returns the spacing of a box's grid, and its coordinates along each axis; world units."""
+    spacing = float((high - low).max()) / resolution
+    counts = np.maximum(np.rint((high - low) / spacing), 1).astype(np.int64) + 1
+    return spacing, [low[i] + spacing * np.arange(counts[i]) for i in range(3)]
 
 
 def look_up_points(
@@ -175,15 +183,14 @@ def sample_surface(
     Raises:
       ValueError: if the field has no surface in the box.
     """
-    spacing = float((high - low).max()) / resolution
-    counts = np.maximum(np.rint((high - low) / spacing), 1).astype(np.int64) + 1
-    axes = [low[i] + spacing * np.arange(counts[i]) for i in range(3)]
+    spacing, axes = _axes(low, high, resolution)
+    counts = [len(axis) for axis in axes]
     values = np.zeros(counts, np.float32)
     for i, x in enumerate(axes[0]):
         points = np.stack(np.meshgrid([x], axes[1], axes[2], indexing="ij"), axis=-1)
         found = look_up_surfaces(model, points.reshape(-1, 3), None)
         values[i] = found[0].reshape(values[i].shape)
-        step(i + 1, int(counts[0]))
+        step(i + 1, counts[0])
     within = (slice(1, -1),) * 3
     cut = np.maximum(values, spacing)
     cut[within] = values[within]

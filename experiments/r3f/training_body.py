@@ -31,6 +31,9 @@ FLAGS = (METHOD, *_RECONSTRUCTED)
 
 Options = Mapping[str, flags.FlagHolder]
 
+# Options that have no effect with a field inside the object, or that it refuses.
+_EXCLUDE_FIELD = {"tints", "tint_decay", "exposure"}
+
 # File of a run that has begun.
 _CONFIG = "config.json"
 
@@ -203,7 +206,7 @@ def with_parts(
     """Returns a configuration that uses a reconstructed object.
 
     If its reconstruction leaves an error, a field inside the object learns what its shape does not
-    explain, unless another interior is given.
+    explain, unless an interior is given, or an option that excludes a field there.
 
     Args:
       config: configuration, with the folder of the scene.
@@ -219,7 +222,8 @@ def with_parts(
         config = config.decided(reconstruction=folder)
     else:
         config = config_flags.on_top(config, {"reconstruction": folder}, say=say)
-    if config.model.interior is None and (why := _unexplained(made)):
+    free = config.model.interior is None and not _EXCLUDE_FIELD & config.overrides()
+    if free and (why := _unexplained(made)):
         say(why)
         config = config.decided(interior="field")
     is_given = given_index(ior) is not None

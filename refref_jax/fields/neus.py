@@ -317,7 +317,7 @@ def _size(
       size: size of Zip-NeRF's fields.
       grid: hash grid in the ball.
       width: width of the hidden layers.
-      head_on: see `SurfaceConfig`.
+      head_on: shares of the slope's own cosine, as in `SurfaceConfig`.
     """
     plain = size.field
     assert isinstance(plain, GridRadianceConfig)

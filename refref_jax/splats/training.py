@@ -128,8 +128,8 @@ class _Static(NamedTuple):
       kernel: treatment of opacity.
       steps: number of steps of the whole training.
       seed: seed of all random numbers.
-      extent: see `Setup`.
-      centre: see `Setup`.
+      extent: unit of distances, as in `Setup`.
+      centre: centre of the scene, world units.
     """
 
     grid: Grid

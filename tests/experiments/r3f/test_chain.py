@@ -473,7 +473,14 @@ def test_an_object_that_no_model_explains_is_told(after, doubted):
 
 @pytest.mark.parametrize(
     ("after", "given", "interior"),
-    [(0.03, None, None), (0.07, None, "field"), (0.07, "clear", "clear"), (None, None, None)],
+    [
+        (0.03, {}, None),
+        (0.07, {}, "field"),
+        (0.07, {"interior": "clear"}, "clear"),
+        (0.07, {"tints": "learned"}, None),
+        (0.07, {"exposure": "per_image"}, None),
+        (None, {}, None),
+    ],
 )
 def test_a_field_inside_learns_what_a_shape_leaves_unexplained(
     whole, tmp_path, after, given, interior
@@ -482,8 +489,7 @@ def test_a_field_inside_learns_what_a_shape_leaves_unexplained(
     shutil.copytree(whole, made)
     light = records.LightFacts(kept=True, index=1.5, before=0.11, after=after)
     records.write(made, dataclasses.replace(records.read(made), light=light))
-    options = {"interior": given} if given else {}
-    config = TrainConfig().override(reconstruction=str(made), **options)
+    config = TrainConfig().override(reconstruction=str(made), **given)
     parts = [scenes.ball(1.0, subdivisions=1)]
     config = training_body.with_parts(config, parts, made, ior=(), say=said.append)
     assert config.model.interior == interior
