@@ -7,7 +7,8 @@ A run that was trained with a reconstructed object records it in `{run}/body.jso
 import dataclasses
 from pathlib import Path
 
-from experiments.r3f import geometry_stage, light_stage
+from etils import epy
+
 from experiments.r3f.records import IndexFacts, PartFacts, Reconstruction
 from refref_jax import configuration
 from refref_jax.choices import Material
@@ -15,6 +16,9 @@ from refref_jax.data import meshes
 from refref_jax.data.meshes import MeshPart
 from refref_jax.data.scene_assembly import shaded_mesh
 from refref_jax.geometry.triangle_meshes import Mesh, join
+
+with epy.lazy_imports():  # of a second each, and most runs have no reconstruction
+    from experiments.r3f import geometry_stage, light_stage
 
 _FILE = "body.json"
 

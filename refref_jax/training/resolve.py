@@ -41,7 +41,7 @@ from refref_jax.optics.media import INDEX_OF_AIR
 from refref_jax.optics.path_settings import PathSettings, make_path_settings
 from refref_jax.optics.scene import Scene
 from refref_jax.render.checkpoint_io import SavedModel
-from refref_jax.render.model import ModelConfig, has_foreground
+from refref_jax.render.model import ModelConfig, bound_field, has_foreground
 from refref_jax.sampling import scene_bounds
 from refref_jax.training import presets
 from refref_jax.training.config import (
@@ -271,8 +271,8 @@ def _resolve_inside(
     config: TrainConfig, found: SceneAnalysis, settings: PathSettings, reasons: dict[str, str]
 ) -> TrainConfig:
     """Decides the model of the inside of the objects, and the source of their colours."""
-    interior: choices.Interior | None
-    if settings.max_bends == 0:
+    bends, interior = settings.max_bends > 0, None
+    if not bends:
         interior, why = "field", "straight rays ignore the objects"
     elif found.interior == "clear" and config.model.tints != "learned":
         interior, why = "clear", "the objects are clear in scene.json"
@@ -280,16 +280,17 @@ def _resolve_inside(
         interior, why = "absorbing", "objects may absorb light"
     config = _decide(config, reasons, why, interior=interior)
     interior, tints = config.model.interior, config.model.tints
-    if interior != "absorbing" or settings.max_bends == 0:
-        given_as_clear = tints == "given" and found.tints == "none" and interior == "clear"
-        if tints not in (None, "none") and not given_as_clear:
+    if bends and interior == "field" and tints == found.tints == "given":
+        return config
+    if interior != "absorbing" or not bends:
+        as_clear = bends and tints == "given" and found.tints == "none"
+        if not as_clear and tints not in (None, "none"):
+            where = f"interior {interior}{'' if bends else ' and straight rays'}"
             raise ValueError(
-                f"tints={tints} has no effect with interior {interior}"
-                f"{'' if settings.max_bends else ' and straight rays'}. Leave it out, or use "
+                f"tints={tints} has no effect with {where}. Leave it out, or use "
                 "interior=absorbing and bent paths."
             )
-        model = dataclasses.replace(config.model, tints=None)
-        config = dataclasses.replace(config, model=model)
+        config = dataclasses.replace(config, model=dataclasses.replace(config.model, tints=None))
         return _decide(config, reasons, f"interior={interior}", tints="none")
     if tints == "none":
         raise ValueError(
@@ -325,8 +326,9 @@ def _resolve_model(
         config = _decide(config, reasons, why, samples_per_ray=fewer)
     in_front: choices.InFront = "field" if _in_front(config, facts) else "nothing"
     model = presets.override_model(model, config.model, in_front=in_front)
-    why = f"preset={config.model.preset}"
-    return model, _decide(config, reasons, why, **presets.sampling_of(model))
+    model = bound_field(model, [part.vertices for part in facts.parts])
+    sampling, why = presets.sampling_of(model), f"preset={config.model.preset}"
+    return model, _decide(config, reasons, why, **sampling)
 
 
 def _resolve_far_field(
@@ -463,9 +465,8 @@ def _resolve_training(
             f"There are {blurs} blurs for {rounds} proposal levels. Give one for each, or leave "
             "them out."
         )
-    preset = presets.PRESETS[config.model.preset]
-    steps = config.schedule.steps or preset.schedule.steps
-    schedule = presets.stretched(preset.schedule, require(steps))
+    usual = presets.PRESETS[config.model.preset].schedule
+    schedule = presets.stretched(usual, require(config.schedule.steps or usual.steps))
     why = f"preset={config.model.preset}"
     config = _decide(config, reasons, why, **presets.schedule_of(schedule))
     presets.check_lengths(config.schedule)
