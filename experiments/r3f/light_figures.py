@@ -32,6 +32,8 @@ def draw(
     surface: Backdrop,
     deviations: Float[np.ndarray, " normals"] | None,
     ends: Callable[[Rays], Float[np.ndarray, "rays 3"]],
+    *,
+    names: tuple[str, str] = ("from masks", "by light"),
 ) -> None:
     """Draws views: the photograph, what both surfaces predict, their errors, and the uncertainty.
 
@@ -46,12 +48,14 @@ def draw(
         has not determined them.
       ends: function of rays that returns the linear RGB of the opaque part that each meets first,
         NaN without any.
+      names: what both surfaces are called.
     """
     frames = scene_folder.read_frames(scene, split)
     count = len(frames.names)
     chosen = np.unique(np.linspace(0, count - 1, min(_ROWS, count)).astype(int))
     masks, images = scene_folder.read_masks(frames), scene_folder.read_images(frames)
-    titles = ("photograph", "from masks", "by light", "error before", "error after", "normals ±")
+    titles = ["photograph", *names, "error before", "error after"]
+    titles += [] if deviations is None else ["normals ±"]
     figure, axes = pyplot.subplots(
         len(chosen),
         len(titles),
@@ -63,17 +67,19 @@ def draw(
         axis.axis("off")
     for axis, title in zip(axes[0], titles, strict=True):
         axis.set_title(title, fontsize=9)
-    trials, shown = (before, after), None
+    trials = (before, after)
     for row, view in zip(axes, chosen, strict=True):
         panels = _panels(frames, int(view), images[view], masks[view], trials, surface, ends)
         for axis, panel in zip(row[:3], panels[:3], strict=True):
             axis.imshow(panel)
         for axis, panel in zip(row[3:5], panels[3:], strict=True):
             errors = axis.imshow(panel, vmin=0.0, vmax=_MOST_ERROR, cmap="magma")
-        seen = _seen_deviations(frames, int(view), after, deviations)
-        shown = row[5].imshow(seen, vmin=0.0, vmax=_MOST_DEVIATION, cmap="viridis")
+        if deviations is not None:
+            seen = _seen_deviations(frames, int(view), after, deviations)
+            shown = row[5].imshow(seen, vmin=0.0, vmax=_MOST_DEVIATION, cmap="viridis")
     figure.colorbar(errors, ax=axes[:, 3:5], label="sRGB", shrink=0.8, aspect=40, pad=0.01)
-    figure.colorbar(shown, ax=axes[:, 5], label="degrees", shrink=0.8, aspect=40, pad=0.01)
+    if deviations is not None:
+        figure.colorbar(shown, ax=axes[:, 5], label="degrees", shrink=0.8, aspect=40, pad=0.01)
     figure.savefig(path, dpi=110)
     pyplot.close(figure)
 
@@ -109,14 +115,14 @@ _SHAPES = {"origins": (3,), "directions": (3,), "radii": ()}
 
 
 def _seen_deviations(
-    frames: Frames, view: int, trial: Trial, deviations: Float[np.ndarray, " normals"] | None
+    frames: Frames, view: int, trial: Trial, deviations: Float[np.ndarray, " normals"]
 ) -> Float[np.ndarray, "h w"]:
     """Returns the deviation of the normal that each pixel sees, NaN beside the object."""
     rays = image_rays(frames.cameras, view)
     first = find_first_surface(pack_meshes([trial.mesh]), rays)
     seen = np.full(first.distances.shape, np.nan)
     hit = np.isfinite(first.distances)
-    if deviations is None or not hit.any():
+    if not hit.any():
         return seen
     part = trial.model.pose(trial.fit.x).parts[0]
     of_vertices = np.zeros(len(part.vertices))

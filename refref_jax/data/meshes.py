@@ -140,6 +140,7 @@ def read_meshes(
     *,
     indices: Mapping[str, float] | None = None,
     properties: SceneProperties | None = None,
+    folder: Path | None = None,
 ) -> list[MeshPart]:
     """Reads all parts of a scene, ordered by name.
 
@@ -148,6 +149,7 @@ def read_meshes(
       indices: indices of refraction that replace or extend the table and `scene.json`, by
         material or, for one part alone, by file stem.
       properties: properties of the scene; by default those of its `scene.json`.
+      folder: folder of other mesh files.
 
     Raises:
       SceneError: if a mesh is broken or empty, if its material is unknown, if an index is not
@@ -157,7 +159,8 @@ def read_meshes(
     overrides = dict(indices or {})
     for name, index in overrides.items():
         check_index(name, index)
-    paths, found = mesh_files(scene), properties or scene_properties.read(scene)
+    paths = mesh_files(scene) if folder is None else sorted(folder.glob("*.ply"))
+    found = properties or scene_properties.read(scene)
     table = INDEX_OF_REFRACTION | dict(found.indices) | overrides
     _check_overrides(overrides, paths, table)
     foreign = set(found.indices) - set(INDEX_OF_REFRACTION)

@@ -8,12 +8,15 @@ about a third of a pixel. Masks that are wrong, or show something else, lose the
 
 `fit_profile` fits a body of revolution to outlines alone. A mesh from masks is up to half a pixel
 too narrow and has waves along its profile; the outlines of all views together determine it to some
-hundredths of a pixel, and its normals to half a degree.
+hundredths of a pixel, and its normals to half a degree. `fit_placement` moves, turns and scales an
+object of known shape until its outlines are those of the masks.
 
 Source: Cipolla and Blake, Surface Shape from the Deformation of Apparent Contours (1992), for the
 derivative; its use beside refraction is ours.
 """
 
+import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -21,12 +24,14 @@ import scipy.sparse
 from jaxtyping import Float, Int
 
 from refref_jax.geometry.cameras import Cameras, project
-from refref_jax.geometry.triangle_meshes import unit_vectors
+from refref_jax.geometry.triangle_meshes import Mesh, diameter, unit_vectors
+from refref_jax.optics.media import Interfaces
+from refref_jax.reconstruct import ReconstructionError
 from refref_jax.reconstruct.families import Revolution
 from refref_jax.reconstruct.gauss_newton import Candidate, Rows
 from refref_jax.reconstruct.masks import Views, signed_distances
 from refref_jax.reconstruct.relief import Relief
-from refref_jax.reconstruct.shapes import Posed
+from refref_jax.reconstruct.shapes import LARGEST_STEP, LARGEST_TURN, Posed
 
 # Standard deviation of a signed distance, and the distance at which a point has lost half of its
 # weight, in pixels; points that are further away are of an inner edge, which a mask does not show.
@@ -38,6 +43,11 @@ _POINTS = 100
 # Steps of the fit of a profile, and the standard deviation of the second differences of its knots,
 # as a share of the diameter: neighbouring points have errors that are alike.
 _ROUNDS, _BEND = 5, 0.001
+
+# Steps of the fit of a placement, and the change, relative to the scales of the unknowns, that ends
+# it; standard deviations of its prior: radians, shares of the diameter, logarithm of the size.
+_PLACEMENT_ROUNDS, _PLACED = 30, 1e-4
+_TURN, _SHIFT, _GROWTH = 0.2, 0.1, 0.2
 
 # Largest error of a body with a relief, as a share of that of the body without it.
 _BETTER = 0.95
@@ -60,15 +70,19 @@ class _Rim(NamedTuple):
 class Outlines:
     """The outlines of masks, as a function of a candidate to `Rows`."""
 
-    def __init__(self, views: Views, *, common: float = 0.0, seed: int = 0) -> None:
+    def __init__(
+        self, views: Views, *, common: float = 0.0, seed: int = 0, reach: float = _FURTHEST
+    ) -> None:
         """Measures the signed distances of all masks.
 
         Args:
           views: masks and their cameras.
           common: standard deviation, in pixels, of how much too wide all masks are.
           seed: seed of the draws of rim points.
+          reach: distance from an outline beyond which points have no say, pixels.
         """
         self._cameras, self._common, self._seed = views.cameras, common, seed
+        self._reach = reach
         self._distances = [
             signed_distances(mask).astype(np.float32) if mask.any() and not mask.all() else None
             for mask in views.masks
@@ -90,8 +104,19 @@ class Outlines:
         ]
         errors = np.concatenate([each[0] for each in found])
         derivatives = scipy.sparse.vstack([each[1] for each in found]).tocsr()
-        weights = 1.0 / (1.0 + (errors * _DEVIATION / _WRONG) ** 2) ** 2
+        wrong = _WRONG * self._reach / _FURTHEST
+        weights = 1.0 / (1.0 + (errors * _DEVIATION / wrong) ** 2) ** 2
         return Rows(errors, derivatives @ part.by_vertices, weights, self._common / _DEVIATION)
+
+    def of_surfaces(self, parts: Sequence[Posed]) -> Rows:
+        """Returns the equations of the outlines of surfaces that depend on the same unknowns."""
+        each = [self.of_surface(part) for part in parts]
+        return Rows(
+            np.concatenate([rows.errors for rows in each]),
+            np.concatenate([rows.derivatives for rows in each]),
+            np.concatenate([rows.weights for rows in each]),
+            each[0].common,
+        )
 
     def _of_view(
         self,
@@ -111,7 +136,7 @@ class Outlines:
         distance, slope = _sample(distances, seen.pixels)
         size = np.array([self._cameras.width, self._cameras.height])
         visible = (seen.depths > 0.0) & np.all((seen.pixels > 0) & (seen.pixels < size), axis=-1)
-        near = np.flatnonzero((np.abs(distance) < _FURTHEST) & visible)
+        near = np.flatnonzero((np.abs(distance) < self._reach) & visible)
         near = generator.permutation(near)[:_POINTS]
         rows = _by_points(slope[near], seen.pixels[near], seen.depths[near], pose, self._cameras)
         first, second = rim.first[near], rim.second[near]
@@ -157,6 +182,138 @@ def _error(outer: Revolution, outlines: Outlines) -> float:
     """Returns the mean distance from the outlines, in standard deviations, up to the largest."""
     errors = outlines.of_surface(outer.pose(outer.start())).errors
     return float(np.mean(np.minimum(np.abs(errors), _WRONG / _DEVIATION)))
+
+
+class PlacedObject:
+    """An object of known shape whose direction, place and size are unknown, for `gauss_newton`.
+
+    The unknowns are a rotation vector about the middle of the object, in radians; a shift in world
+    units; and the logarithm of its size. Indices, tints and absorptions are known.
+
+    Attributes:
+      meshes: surface of each part as it is given, the order of `interfaces`.
+      interfaces: interfaces of the parts.
+      centre: middle of the box around all parts, world units.
+    """
+
+    def __init__(self, meshes: Sequence[Mesh], interfaces: Interfaces) -> None:
+        """Takes the parts.
+
+        Raises:
+          ReconstructionError: if there are none.
+        """
+        if not meshes:
+            raise ReconstructionError("The object has no parts. Pass at least one closed mesh.")
+        self.meshes, self.interfaces = tuple(meshes), interfaces
+        vertices = np.concatenate([mesh.vertices for mesh in meshes])
+        self.centre = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
+        self._size = diameter(vertices)
+
+    def start(self) -> Float[np.ndarray, "7"]:
+        """Returns zeros: the object as it is given."""
+        return np.zeros(7)
+
+    def pose(self, x: Float[np.ndarray, "7"]) -> Candidate:
+        """Returns the placed object."""
+        nothing = scipy.sparse.csr_array((len(self.meshes), 7))
+        posed = [self._placed(mesh, x) for mesh in self.meshes]
+        return Candidate(posed, self.interfaces, nothing, nothing[:0])
+
+    def index_of(self, x: Float[np.ndarray, "7"]) -> float:
+        """Returns the index of the first part, which is known."""
+        del x
+        return float(self.interfaces.index_inside[0])
+
+    def placed(self, x: Float[np.ndarray, "7"]) -> tuple[Mesh, ...]:
+        """Returns the surfaces of the placed parts."""
+        posed = [self._placed(mesh, x) for mesh in self.meshes]
+        return tuple(Mesh(p.vertices, p.faces, p.normals[p.normal_ids]) for p in posed)
+
+    def prior(
+        self, x: Float[np.ndarray, "7"]
+    ) -> tuple[Float[np.ndarray, "7 7"], Float[np.ndarray, "7"]]:
+        """Returns a wide prior around the object as it is given.
+
+        It keeps what neither outlines nor light determine, such as the rotation of a ball.
+        """
+        deviations = np.repeat([_TURN, _SHIFT * self._size, _GROWTH], [3, 3, 1])
+        return np.diag(deviations**-2.0), x / deviations**2
+
+    def scales(self) -> Float[np.ndarray, "7"]:
+        """Returns 0.02 radians, 0.77 % of the diameter, and 1 % of the size."""
+        return np.repeat([LARGEST_TURN, LARGEST_STEP * self._size, 0.01], [3, 3, 1])
+
+    def _placed(self, mesh: Mesh, x: Float[np.ndarray, "7"]) -> Posed:
+        turn, tangent = rotation(x[:3])
+        arms = math.exp(x[6]) * (mesh.vertices - self.centre) @ turn.T
+        normals, ids = np.unique(mesh.normals.reshape(-1, 3), axis=0, return_inverse=True)
+        normals = normals @ turn.T
+        moves = np.broadcast_to(np.eye(3), (len(arms), 3, 3))
+        still = np.zeros((len(normals), 3, 4))
+        by_vertices = np.concatenate([-_crosses(arms) @ tangent, moves, arms[..., None]], axis=-1)
+        by_normals = np.concatenate([-_crosses(normals) @ tangent, still], axis=-1)
+        return Posed(
+            self.centre + x[3:6] + arms,
+            mesh.faces,
+            normals,
+            ids.reshape(-1, 3),
+            by_vertices.reshape(-1, 7),
+            by_normals.reshape(-1, 7),
+        )
+
+
+def rotation(
+    vector: Float[np.ndarray, "3"],
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"]]:
+    """Returns the rotation of a rotation vector, and its left Jacobian.
+
+    A change `dv` of the vector turns the rotated object by the further rotation vector `J dv`.
+
+    Source: Rodrigues' formula; Sola, Deray and Atchuthan, A micro Lie theory (2018), Eq 145.
+    """
+    angle = float(np.linalg.norm(vector))
+    cross = _crosses(vector)
+    if angle < 1e-6:
+        return np.eye(3) + cross, np.eye(3) + 0.5 * cross
+    sine, cosine = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2
+    turn = np.eye(3) + sine * cross + cosine * cross @ cross
+    return turn, np.eye(3) + cosine * cross + (1.0 - sine) / angle**2 * cross @ cross
+
+
+def _crosses(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
+    """Returns the matrices of the cross products with vectors."""
+    return np.swapaxes(np.cross(vectors[..., None, :], np.eye(3)), -1, -2)
+
+
+def fit_placement(
+    model: PlacedObject,
+    outlines: Outlines,
+    *,
+    outermost: Sequence[int] = (0,),
+    x: Float[np.ndarray, "7"] | None = None,
+) -> Float[np.ndarray, "7"]:
+    """Fits direction, place and size of an object to outlines alone.
+
+    What outlines do not determine, such as the direction of a ball, stays.
+
+    Args:
+      model: the object.
+      outlines: the outlines; those with a long reach first, if the object is far away.
+      outermost: numbers of the parts that no other part contains.
+      x: placement to begin with; the object as it is given by default.
+    """
+    x = model.start() if x is None else x
+    for _ in range(_PLACEMENT_ROUNDS):
+        parts = model.pose(x).parts
+        rows = outlines.of_surfaces([parts[number] for number in outermost])
+        weighted = rows.weights[:, None] * rows.derivatives
+        precision, gradient = model.prior(x)
+        matrix = weighted.T @ rows.derivatives + precision
+        change = -np.linalg.solve(matrix, weighted.T @ rows.errors + gradient)
+        x = x + change
+        if np.max(np.abs(change) / model.scales()) < _PLACED:
+            break
+    return x
 
 
 def _vertex_normals(part: Posed) -> Float[np.ndarray, "vertices 3"]:

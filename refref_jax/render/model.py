@@ -8,12 +8,10 @@ meaningless if the model takes no samples there.
 
 import dataclasses
 import math
-from collections.abc import Sequence
 from typing import NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from refref_jax import numerics
@@ -45,9 +43,6 @@ _CONVEX_LEGS = 2
 # Light that leaves and re-enters objects has more outer segments, but few: with four, 0.04 % of the
 # light of a torus has an omitted segment, which is then treated as empty.
 _MOST_LEGS = 4
-
-# Edge of the cube of a field in front of a backdrop, in extents of the objects.
-_MARGIN = 1.05
 
 
 @dataclasses.dataclass(frozen=True)
@@ -144,9 +139,6 @@ class ModelConfig:
         as in models of earlier versions, or at the `end` of the path, which is on a surface if the
         scene is bounded or spherical; if it is unbounded, always in the middle.
       splats: Gaussians that take the place of all fields, or `None`.
-      field_radius: half edge of the cube of a field in front of a backdrop; `None` for the scene
-        bounds, as in models of earlier versions.
-      field_centre: centre of that cube.
     """
 
     proposals: tuple[ProposalConfig, ...]
@@ -166,20 +158,11 @@ class ModelConfig:
     backdrop: BackdropConfig | None = None
     last_sample: LastSample = "middle"
     splats: SplatsConfig | None = None
-    field_radius: float | None = None
-    field_centre: Position = ORIGIN
 
     @property
     def domain(self) -> scene_bounds.Domain:
         """The scene bounds."""
         return scene_bounds.Domain(self.radius, self.space, self.centre)
-
-    @property
-    def field_domain(self) -> scene_bounds.Domain:
-        """The part of space that the fields store: the scene bounds, or the objects' cube."""
-        if self.field_radius is None:
-            return self.domain
-        return scene_bounds.Domain(self.field_radius, "bounded", self.field_centre)
 
     def __post_init__(self) -> None:
         """Validates the values."""
@@ -190,9 +173,8 @@ class ModelConfig:
                 f"The distances near = {self.near} and far = {self.far} are invalid. Choose them "
                 f"such that 0 <= near < far."
             )
-        for name, value in {"radius": self.radius, "field_radius": self.field_radius}.items():
-            if value is not None and not 0.0 < value < math.inf:
-                raise ValueError(f"{name} is {value}. Give a positive, finite radius.")
+        if not 0.0 < self.radius < math.inf:
+            raise ValueError(f"radius is {self.radius}. Give a positive, finite radius.")
         if not all(map(math.isfinite, self.centre)):
             raise ValueError(f"centre is {self.centre}. Give three finite numbers of world units.")
         if self.learned_tints < 0:
@@ -321,26 +303,6 @@ def init_params(key: Array, config: ModelConfig) -> Params:
 def has_foreground(config: ModelConfig) -> bool:
     """Returns whether a field is in front of a backdrop."""
     return config.backdrop is not None and config.backdrop.in_front == "field"
-
-
-def bound_field(
-    config: ModelConfig, objects: Sequence[Float[np.ndarray, "vertices 3"]]
-) -> ModelConfig:
-    """Returns a model whose field, if it is in front of a backdrop, is in a cube of the objects.
-
-    Nothing else is in front of it, and the cells of the field are smaller than in the whole scene.
-
-    Args:
-      config: configuration of the model.
-      objects: vertices of each object, world units.
-    """
-    if not has_foreground(config) or not objects:
-        return config
-    vertices = np.concatenate(objects)
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
-    x, y, z = (float(middle) for middle in 0.5 * (low + high))
-    radius = 0.5 * _MARGIN * float(np.max(high - low))
-    return dataclasses.replace(config, field_radius=radius, field_centre=(x, y, z))
 
 
 def surface_of(params: Params) -> Pyramid:

@@ -326,7 +326,7 @@ def _opaque_surface(params: Params, config: ModelConfig, whole: Polyline) -> Flo
     assert whole.stop is not None
     at = jnp.where(jnp.isfinite(whole.stop), whole.stop, 0.0)
     cone = polylines.multisamples(whole, at, at, jnp.zeros_like(at), count=config.multisamples)
-    cell = scene_bounds.to_unit_cube(config.field_domain, cone)
+    cell = scene_bounds.to_unit_cube(config.domain, cone)
     direction = polylines.point_at(whole, at).direction
     seen = registry.radiance(_field_of(params), config.field, cell, direction)
     if not isinstance(seen, SubSpaces):
@@ -437,7 +437,7 @@ def sample(
 
     def cone(start: Array, end: Array, turn: Array) -> Gaussians:
         world = polylines.multisamples(line, start, end, turn, count=config.multisamples)
-        return scene_bounds.to_unit_cube(config.field_domain, world)
+        return scene_bounds.to_unit_cube(config.domain, world)
 
     return Samples(s, t, jax.vmap(cone)(starts, ends, turns), points)
 

@@ -29,9 +29,10 @@ with `small`, whose steps take 3.1 times as long. `paper` and `best` require a G
 0.8 s for 256 of their rays, 10 times as long as `tiny`
 (`benchmarks/results/presets_few_rays.csv`).
 
-`best` has the samples of the paper, but ray differentials, so that footprints follow the bends, and
-four times as many rays per step, at the learning rate that Zip-NeRF uses for 65,536. It traces
-fewer batches at once, so that pre-traced batches take as much memory as those of `paper`.
+`small` is between its neighbours in every number. `best` has the samples of the paper, but ray
+differentials, so that footprints follow the bends, and four times as many rays per step, at the
+learning rate that Zip-NeRF uses for 65,536. It traces fewer batches at once, so that pre-traced
+batches have as many rays, and take as much memory, as those of `paper`.
 
 Of Gaussian splats, a preset has the number (20,000, 50,000, 500,000 and 1,000,000) and the steps,
 of one image each.

@@ -41,7 +41,7 @@ from refref_jax.optics.media import INDEX_OF_AIR
 from refref_jax.optics.path_settings import PathSettings, make_path_settings
 from refref_jax.optics.scene import Scene
 from refref_jax.render.checkpoint_io import SavedModel
-from refref_jax.render.model import ModelConfig, bound_field, has_foreground
+from refref_jax.render.model import ModelConfig, has_foreground
 from refref_jax.sampling import scene_bounds
 from refref_jax.training import presets
 from refref_jax.training.config import (
@@ -326,7 +326,6 @@ def _resolve_model(
         config = _decide(config, reasons, why, samples_per_ray=fewer)
     in_front: choices.InFront = "field" if _in_front(config, facts) else "nothing"
     model = presets.override_model(model, config.model, in_front=in_front)
-    model = bound_field(model, [part.vertices for part in facts.parts])
     sampling, why = presets.sampling_of(model), f"preset={config.model.preset}"
     return model, _decide(config, reasons, why, **sampling)
 

@@ -11,7 +11,7 @@ from refref_jax.fields import registry
 from refref_jax.fields.base import Radiance
 from refref_jax.optics.light_paths import Stop
 from refref_jax.render import backdrop, pixels
-from refref_jax.render.model import BackdropConfig, Layers, Params, bound_field, init_params
+from refref_jax.render.model import BackdropConfig, Layers, Params, init_params
 from tests.factories import made_paths
 from tests.factories.small_model import MODEL
 
@@ -55,22 +55,6 @@ def plant(monkeypatch):
         return jax.tree.map(lambda x: x[0], seen)
 
     return render
-
-
-def test_a_field_in_front_fills_the_cube_of_the_objects(plant, monkeypatch):
-    def place(fog, config, gaussians, direction):
-        return Radiance(fog, gaussians.positions[0])
-
-    corners = [np.array([[-1.0, -1.0, 1.0]]), np.array([[1.0, 2.0, 5.0]])]
-    config = bound_field(_INSIDE, corners)
-    assert config.field_centre == (0.0, 0.5, 3.0) and 2.0 < config.field_radius < 2.2
-    assert config.domain == _INSIDE.domain
-    monkeypatch.setattr(registry, "radiance", place)
-    # The path enters at (0, 0, 1), below the centre, and is opaque there.
-    seen = plant(config, _bent(), 1e6).composite
-    expected = 0.5 + 0.5 * np.array([0.0, -0.5, -2.0]) / config.field_radius
-    np.testing.assert_allclose(seen.rgb, expected, atol=0.05)
-    assert bound_field(MODEL, corners) == MODEL and bound_field(_INSIDE, []) == _INSIDE
 
 
 @pytest.mark.parametrize("fog", [0.0, 1e-6, 0.8, 30.0, 1e6])

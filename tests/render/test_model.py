@@ -13,10 +13,3 @@ def test_samples_may_begin_at_the_camera():
 def test_distances_out_of_order_are_refused(near, far):
     with pytest.raises(ValueError, match="0 <= near < far"):
         dataclasses.replace(MODEL, near=near, far=far)
-
-
-@pytest.mark.parametrize("radius", [0.0, -1.0, float("inf"), float("nan")])
-def test_a_cube_of_no_size_is_refused(radius):
-    for name in ("radius", "field_radius"):
-        with pytest.raises(ValueError, match=f"{name} is {radius}"):
-            dataclasses.replace(MODEL, **{name: radius})

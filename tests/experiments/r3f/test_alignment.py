@@ -1,0 +1,95 @@
+"""Objects that lie wrong: placed by outlines, placed by light, and read as reconstructions."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments.r3f import alignment, chain, index_stage, records, training_body
+from experiments.r3f.alignment import Background
+from refref_jax.data import SceneError, meshes
+from refref_jax.geometry.triangle_meshes import make_mesh
+from refref_jax.training.config import TrainConfig
+from tests.factories import bodies, scenes
+from tests.factories.silhouettes import RADIUS, write_scene
+
+_BUNDLED = Path(__file__).parents[3] / "experiments" / "data" / "cube_smcvx_ball"
+_OWN = Background(None, None, None)
+
+
+def _spoilt(part, *, size=1.03, shift=(0.02, -0.01, 0.03)):
+    mesh = make_mesh(size * part.vertices + np.array(shift), part.faces)
+    return part._replace(vertices=mesh.vertices, normals=None)
+
+
+def _errors(parts):
+    """Returns the place and the size of a ball, in shares of the true radius."""
+    radii = np.linalg.norm(parts[0].vertices - parts[0].vertices.mean(axis=0), axis=1)
+    return np.linalg.norm(parts[0].vertices.mean(axis=0)), radii.mean()
+
+
+def test_outlines_place_an_object_before_a_field(tmp_path, monkeypatch):
+    scene = write_scene(tmp_path / "cube_smcvx_ball", size=64)
+    monkeypatch.setattr(index_stage, "learn_backdrop", lambda *_, **options: None)
+    parts = [_spoilt(meshes.read_meshes(scene)[0]._replace(colour_known=True))]
+    out = tmp_path / "out"
+    out.mkdir()
+    facts = alignment.align(scene, parts, out, _OWN, seed=0)
+    place, radius = _errors(chain.read_parts(out))
+    assert place < 0.005 and radius == pytest.approx(RADIUS, rel=0.005)
+    assert facts.size == pytest.approx(1.0 / 1.03, rel=0.005) and facts.error is None
+    assert "outlines alone" in alignment.describe(facts)
+    found = records.read(out)
+    assert found.light.kept and found.light.parts[0].index == parts[0].index
+    assert found.inputs == chain.fingerprint(scene)
+    config = TrainConfig().override(reconstruction=str(out))
+    read = chain.read_parts(out)
+    config = training_body.with_parts(config, read, out, ior=(), say=lambda line: None)
+    assert config.model.interior is None  # nothing says that the shape is wrong
+
+
+@pytest.mark.slow
+def test_light_places_an_object_within_a_thousandth(tmp_path):
+    parts = [_spoilt(part) for part in meshes.read_meshes(_BUNDLED)]
+    true = meshes.read_meshes(_BUNDLED)[0].vertices
+    facts = alignment.align(_BUNDLED, parts, tmp_path, _OWN, seed=0)
+    assert facts.light < facts.outlines < 0.3 * facts.given
+    found = chain.read_parts(tmp_path)[0].vertices
+    extent = np.ptp(true, axis=0)
+    np.testing.assert_allclose(np.ptp(found, axis=0), extent, rtol=1e-3)
+    middle = 0.5 * (found.max(axis=0) + found.min(axis=0))
+    expected = 0.5 * (true.max(axis=0) + true.min(axis=0))
+    np.testing.assert_allclose(middle, expected, atol=1e-3 * extent.max())
+    assert (tmp_path / alignment.FIGURE).is_file()
+    assert "by light" in alignment.describe(facts)
+
+
+def test_a_placement_is_applied_as_its_file_says(tmp_path):
+    ball = scenes.ball(1.0, subdivisions=1)
+    facts = alignment.PlacementFacts(
+        *((0.0, 0.0, 90.0), (1.0, 0.0, 0.0), 2.0, (0.0, 1.0, 0.0)),
+        *((0.1,) * 3, (0.1,) * 3, 0.1, 0.2, 0.1, 0.07, "val"),
+    )
+    (placed,) = alignment.placed_parts([ball], facts)
+    x, y, z = (ball.vertices - [0.0, 1.0, 0.0]).T
+    expected = np.array([1.0, 1.0, 0.0]) + 2.0 * np.stack([-y, x, z], axis=-1)
+    np.testing.assert_allclose(placed.vertices, expected, atol=1e-9)
+    assert "an error of 0.0700 is left" in alignment.describe(facts)
+
+
+def test_rough_objects_and_none_are_refused():
+    ball = scenes.ball(1.0, subdivisions=1)
+    rough = ball._replace(material=ball.material._replace(roughness=0.2))
+    with pytest.raises(SceneError, match="is rough, or not a dielectric"):
+        alignment.placed_object([rough])
+    with pytest.raises(SceneError, match="no meshes to align"):
+        alignment.placed_object([])
+
+
+def test_other_meshes_than_the_scenes_are_read_by_their_names(tmp_path):
+    scene = write_scene(tmp_path / "scene", meshes=False)
+    other = tmp_path / "scan"
+    other.mkdir()
+    meshes.write_mesh(other / "scan_diamond.ply", *bodies.icosphere(2))
+    (part,) = meshes.read_meshes(scene, folder=other)
+    assert (part.name, part.index) == ("scan_diamond", meshes.INDEX_OF_REFRACTION["diamond"])
