@@ -23,7 +23,7 @@ import numpy as np
 from absl import app, flags
 from jaxtyping import Float
 
-from benchmarks.sensitivity import ERRORS, Inputs
+from benchmarks.wrong_inputs import ERRORS, Inputs
 from experiments.r3f import alignment, chain
 from refref_jax.data import meshes, scene_folder, scene_names, scene_properties
 from refref_jax.data.meshes import MeshPart

@@ -205,8 +205,8 @@ def with_parts(
 ) -> TrainConfig:
     """Returns a configuration that uses a reconstructed object.
 
-    If its reconstruction leaves an error, a field inside the object learns what its shape and its
-    colours do not explain, unless an interior is given, or an option that excludes a field there.
+    If its reconstruction leaves an error, a field inside the object learns what its shape does not
+    explain, unless an interior is given, or an option that excludes a field there.
 
     Args:
       config: configuration, with the folder of the scene.
@@ -225,15 +225,9 @@ def with_parts(
     free = config.model.interior is None and not _EXCLUDE_FIELD & config.overrides()
     if free and (why := _unexplained(made)):
         say(why)
-        config = config.decided(interior="field", **_known_colours(parts))
+        config = config.decided(interior="field")
     is_given = given_index(ior) is not None
     return config.override(ior=index) if is_given else config.decided(ior=index)
-
-
-def _known_colours(parts: Sequence[MeshPart]) -> dict[str, str]:
-    from refref_jax.data import scene_analysis
-
-    return {"tints": "given"} if scene_analysis.find_tints(parts) == "given" else {}
 
 
 def _unexplained(made: Path) -> str:

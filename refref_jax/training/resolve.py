@@ -271,8 +271,8 @@ def _resolve_inside(
     config: TrainConfig, found: SceneAnalysis, settings: PathSettings, reasons: dict[str, str]
 ) -> TrainConfig:
     """Decides the model of the inside of the objects, and the source of their colours."""
-    bends, interior = settings.max_bends > 0, None
-    if not bends:
+    interior: choices.Interior | None
+    if settings.max_bends == 0:
         interior, why = "field", "straight rays ignore the objects"
     elif found.interior == "clear" and config.model.tints != "learned":
         interior, why = "clear", "the objects are clear in scene.json"
@@ -280,17 +280,16 @@ def _resolve_inside(
         interior, why = "absorbing", "objects may absorb light"
     config = _decide(config, reasons, why, interior=interior)
     interior, tints = config.model.interior, config.model.tints
-    if bends and interior == "field" and tints == found.tints == "given":
-        return config
-    if interior != "absorbing" or not bends:
-        as_clear = bends and tints == "given" and found.tints == "none"
-        if not as_clear and tints not in (None, "none"):
-            where = f"interior {interior}{'' if bends else ' and straight rays'}"
+    if interior != "absorbing" or settings.max_bends == 0:
+        given_as_clear = tints == "given" and found.tints == "none" and interior == "clear"
+        if tints not in (None, "none") and not given_as_clear:
             raise ValueError(
-                f"tints={tints} has no effect with {where}. Leave it out, or use "
+                f"tints={tints} has no effect with interior {interior}"
+                f"{'' if settings.max_bends else ' and straight rays'}. Leave it out, or use "
                 "interior=absorbing and bent paths."
             )
-        config = dataclasses.replace(config, model=dataclasses.replace(config.model, tints=None))
+        model = dataclasses.replace(config.model, tints=None)
+        config = dataclasses.replace(config, model=model)
         return _decide(config, reasons, f"interior={interior}", tints="none")
     if tints == "none":
         raise ValueError(
@@ -326,8 +325,8 @@ def _resolve_model(
         config = _decide(config, reasons, why, samples_per_ray=fewer)
     in_front: choices.InFront = "field" if _in_front(config, facts) else "nothing"
     model = presets.override_model(model, config.model, in_front=in_front)
-    sampling, why = presets.sampling_of(model), f"preset={config.model.preset}"
-    return model, _decide(config, reasons, why, **sampling)
+    why = f"preset={config.model.preset}"
+    return model, _decide(config, reasons, why, **presets.sampling_of(model))
 
 
 def _resolve_far_field(
@@ -464,8 +463,9 @@ def _resolve_training(
             f"There are {blurs} blurs for {rounds} proposal levels. Give one for each, or leave "
             "them out."
         )
-    usual = presets.PRESETS[config.model.preset].schedule
-    schedule = presets.stretched(usual, require(config.schedule.steps or usual.steps))
+    preset = presets.PRESETS[config.model.preset]
+    steps = config.schedule.steps or preset.schedule.steps
+    schedule = presets.stretched(preset.schedule, require(steps))
     why = f"preset={config.model.preset}"
     config = _decide(config, reasons, why, **presets.schedule_of(schedule))
     presets.check_lengths(config.schedule)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from benchmarks import sensitivity
-from benchmarks.sensitivity import ERRORS, Trial
+from benchmarks.sensitivity import Trial
+from benchmarks.wrong_inputs import ERRORS, Inputs
 from refref_jax.data import scene_folder, scene_properties
 from refref_jax.data.scene_assembly import shaded_mesh
 from tests.factories import scenes
@@ -17,7 +18,7 @@ _BUNDLED = Path(__file__).parents[2] / "experiments" / "data" / "cube_smcvx_ball
 
 @pytest.fixture(scope="module")
 def inputs():
-    return sensitivity.Inputs(
+    return Inputs(
         (scenes.ball(1.0, subdivisions=4),),
         scene_folder.read_frames(_BUNDLED, "test"),
         scene_properties.read(_BUNDLED),

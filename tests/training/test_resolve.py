@@ -78,9 +78,6 @@ def _resolve(found, **given):
         (_CLEAR, {"tints": "learned"}, ("tree", "absorbing", "learned", 1)),
         (_CLEAR, {"interior": "absorbing"}, ("tree", "absorbing", "given", 0)),
         (_CLEAR, {"interior": "field"}, ("tree", "field", "none", 0)),
-        (_TINTED, {"interior": "field"}, ("tree", "field", "none", 0)),
-        (_TINTED, {"interior": "field", "tints": "given"}, ("tree", "field", "given", 0)),
-        (_CLEAR, {"interior": "field", "tints": "given"}, ("tree", "field", "none", 0)),
         (_UNTOLD, {"interior": "clear"}, ("tree", "clear", "none", 0)),
     ],
 )
@@ -278,8 +275,7 @@ def test_resolve_warns_of_what_is_doubtful():
     [
         (_UNTOLD, {"tints": "given"}, "scene.json lacks"),
         (_TINTED, {"tints": "learned", "interior": "clear"}, "no effect with interior clear"),
-        (_TINTED, {"tints": "learned", "interior": "field"}, "no effect with interior field"),
-        (_UNTOLD, {"tints": "given", "interior": "field"}, "no effect with interior field"),
+        (_TINTED, {"tints": "given", "interior": "field"}, "no effect with interior field"),
         (_TINTED, {"tints": "given", "paths": "straight"}, "and straight rays"),
         (_TINTED, {"tints": "none"}, "an absorbing interior has colours"),
         (_EMPTY, {"tints": "learned"}, "no effect"),
