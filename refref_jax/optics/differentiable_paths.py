@@ -34,9 +34,9 @@ from refref_jax.geometry.bvh import NO_PRIMITIVE, closest_primitive
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import light_paths, media, path_step
 from refref_jax.optics.light_paths import LightPaths, PathStatus, Stop
+from refref_jax.optics.media import Scene, in_one_precision
 from refref_jax.optics.path_settings import PathSettings
 from refref_jax.optics.path_step import RayState
-from refref_jax.optics.scene import Scene, in_one_precision
 
 _Record = TypeVar("_Record")
 

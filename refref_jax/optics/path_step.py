@@ -23,8 +23,8 @@ from refref_jax.geometry.surfaces import SurfacePoint
 from refref_jax.optics import fresnel, light_paths, media
 from refref_jax.optics.fresnel import Stratum
 from refref_jax.optics.light_paths import Bend, PathStatus, RayDifferential, Stop
+from refref_jax.optics.media import Scene
 from refref_jax.optics.path_settings import PathSettings
-from refref_jax.optics.scene import Scene
 
 
 class Interaction(NamedTuple):
@@ -297,7 +297,7 @@ def arrive(scene: Scene, state: RayState, primitive_id: Int[Array, ""]) -> Arriv
     if state.strata is not None:
         stratum = Stratum(state.strata[0], state.strata[1], state.strata[2], state.num_bends)
     if media.has_dispersion(interfaces):  # the ray carries light of one channel
-        interfaces = media.of_channel(interfaces, jnp.argmax(state.throughput))
+        interfaces = media.interfaces_of_channel(interfaces, jnp.argmax(state.throughput))
 
     def surface(
         origin: Float[Array, "3"], direction: Float[Array, "3"], tilt: Float[Array, "2"] | None

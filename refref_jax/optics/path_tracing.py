@@ -30,8 +30,8 @@ from refref_jax.optics.light_paths import (
     straight,
     straight_ends,
 )
+from refref_jax.optics.media import Scene, in_one_precision
 from refref_jax.optics.path_settings import Detail, PathSettings, capacities
-from refref_jax.optics.scene import Scene, in_one_precision
 from refref_jax.optics.wavefront import follow
 
 

@@ -30,6 +30,7 @@ from refref_jax.geometry import bvh
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import light_paths, media, path_settings, path_step, path_tree
 from refref_jax.optics.light_paths import PathStatus, Stop
+from refref_jax.optics.media import Scene
 from refref_jax.optics.path_settings import Capacities, PathSettings
 from refref_jax.optics.path_step import Arrival, Branches, RayState
 from refref_jax.optics.path_tree import (
@@ -41,7 +42,6 @@ from refref_jax.optics.path_tree import (
     Segments,
     join,
 )
-from refref_jax.optics.scene import Scene
 
 StoredSegments = Literal["all", "last"]
 

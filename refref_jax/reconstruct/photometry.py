@@ -35,9 +35,8 @@ from refref_jax.geometry.surfaces import Surfaces
 from refref_jax.optics import light_paths, path_tracing
 from refref_jax.optics.differentiable_paths import find_primitives, follow_branch
 from refref_jax.optics.light_paths import PathStatus
-from refref_jax.optics.media import AMBIENT, INDEX_OF_AIR, Interfaces
+from refref_jax.optics.media import AMBIENT, INDEX_OF_AIR, Interfaces, Scene
 from refref_jax.optics.path_settings import TREE, PathSettings
-from refref_jax.optics.scene import Scene
 from refref_jax.render import backdrop, images, pixels
 from refref_jax.render.backdrop import Lookups, Mips
 from refref_jax.sampling.scene_bounds import Domain

@@ -22,9 +22,8 @@ from refref_jax import configuration
 from refref_jax.fields import registry
 from refref_jax.geometry.bvh import BVH
 from refref_jax.geometry.surfaces import Surfaces
-from refref_jax.optics.media import Interfaces
+from refref_jax.optics.media import Interfaces, Scene
 from refref_jax.optics.path_settings import PathSettings
-from refref_jax.optics.scene import Scene
 from refref_jax.render.model import Model, ModelConfig, Params, init_params
 
 _MODEL = "model.json"

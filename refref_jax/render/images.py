@@ -30,10 +30,9 @@ from refref_jax.geometry.surfaces import Surfaces, surface_point
 from refref_jax.numerics import host_array
 from refref_jax.optics import light_paths, path_tracing
 from refref_jax.optics.light_paths import Branch, LightPaths, reflected_first
-from refref_jax.optics.media import EMPTY_SLOT
+from refref_jax.optics.media import EMPTY_SLOT, Scene
 from refref_jax.optics.path_settings import Detail, PathSettings
 from refref_jax.optics.path_tracing import Traced
-from refref_jax.optics.scene import Scene
 from refref_jax.render import learned_media, pixels
 from refref_jax.render.model import Model, ModelConfig, Params, path_detail
 from refref_jax.render.model import Rendering as Rendering

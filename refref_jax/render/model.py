@@ -29,8 +29,8 @@ from refref_jax.choices import (
 from refref_jax.fields import base, registry
 from refref_jax.fields.base import DensityConfig, Radiance, RadianceConfig, Surface
 from refref_jax.fields.neus import SurfaceConfig
+from refref_jax.optics.media import Scene
 from refref_jax.optics.path_settings import Detail, PathSettings, Tally
-from refref_jax.optics.scene import Scene
 from refref_jax.render import backdrop, learned_media
 from refref_jax.render.backdrop import Pyramid
 from refref_jax.render.learned_media import LearnedTints

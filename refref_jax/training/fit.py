@@ -24,7 +24,7 @@ from refref_jax import atomic_files, compilation, configuration
 from refref_jax.data import image_files, scene_analysis, scene_folder, scene_source
 from refref_jax.data.batches import PixelSampler
 from refref_jax.data.meshes import MeshPart
-from refref_jax.optics.scene import Scene
+from refref_jax.optics.media import Scene
 from refref_jax.render import checkpoint_io
 from refref_jax.render.checkpoint_io import SavedModel
 from refref_jax.render.model import Model, ModelConfig, Params, has_foreground

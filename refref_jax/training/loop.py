@@ -21,9 +21,9 @@ from refref_jax.data.batches import PixelSampler
 from refref_jax.fields import registry
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import light_paths, path_tracing
+from refref_jax.optics.media import Scene
 from refref_jax.optics.path_settings import Detail, PathSettings, capacity_for
 from refref_jax.optics.path_tracing import Survey, Traced
-from refref_jax.optics.scene import Scene
 from refref_jax.render import pixels
 from refref_jax.render.model import (
     ModelConfig,

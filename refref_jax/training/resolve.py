@@ -37,9 +37,8 @@ from refref_jax.data.scene_analysis import SceneAnalysis
 from refref_jax.data.scene_assembly import assemble_scene
 from refref_jax.data.scene_properties import SceneProperties
 from refref_jax.geometry.cameras import Cameras
-from refref_jax.optics.media import INDEX_OF_AIR
+from refref_jax.optics.media import INDEX_OF_AIR, Scene
 from refref_jax.optics.path_settings import PathSettings, make_path_settings
-from refref_jax.optics.scene import Scene
 from refref_jax.render.checkpoint_io import SavedModel
 from refref_jax.render.model import ModelConfig, has_foreground
 from refref_jax.sampling import scene_bounds
