@@ -30,8 +30,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from refref_jax.choices import Footprint
-from refref_jax.geometry.bvh import NO_PRIMITIVE, closest_primitive
+from refref_jax.geometry.bvh import NO_PRIMITIVE
 from refref_jax.geometry.rays import Rays
+from refref_jax.geometry.surfaces import LevelSet, closest
 from refref_jax.optics import light_paths, media, path_step
 from refref_jax.optics.light_paths import LightPaths, PathStatus, Stop
 from refref_jax.optics.media import Scene, in_one_precision
@@ -203,8 +204,8 @@ def _advance(
     reflect, primitive_id = choice
     if primitive_id is None:
         limit = jnp.where(alive & walk.traced, jnp.inf, -1.0).astype(state.tau.dtype)
-        primitive_id = closest_primitive(
-            scene.surfaces.bvh, state.origin, state.direction, limit, state.exclude_primitive
+        primitive_id = closest(
+            scene.surfaces, state.origin, state.direction, limit, state.exclude_primitive
         )
     hit = primitive_id != NO_PRIMITIVE
     arrival = path_step.arrive(scene, state, primitive_id)
@@ -237,7 +238,7 @@ def _advance(
 def _no_stop(scene: Scene, ray: Rays) -> Stop | None:
     if not media.has_opaque(scene.interfaces):
         return None
-    known = scene.surfaces.radiance.shape[0] > 0
+    known = media.meshes_of(scene).radiance.shape[0] > 0
     infinite = jnp.full_like(ray.radii, jnp.inf)
     return Stop(infinite, jnp.zeros_like(ray.origins) if known else None)
 
@@ -269,7 +270,12 @@ def _record(settings: PathSettings, ray: Rays, end: _Walk, segments: _Segment) -
 
 
 def follow_main_branches(
-    scene: Scene, ray: Rays, *, settings: PathSettings, reflections: int
+    scene: Scene,
+    ray: Rays,
+    *,
+    settings: PathSettings,
+    reflections: int,
+    footprint: Footprint = "cone",
 ) -> LightPaths:
     """Traces one ray along its main path, and along the paths that are reflected once.
 
@@ -278,6 +284,7 @@ def follow_main_branches(
       ray: one camera ray.
       settings: path settings.
       reflections: number of first surfaces at which a reflection is followed.
+      footprint: `differential` carries derivatives across the pixel.
 
     Returns:
       `1 + reflections` paths, the main path first; paths that do not exist are `EMPTY`. Their ray
@@ -317,7 +324,15 @@ def follow_main_branches(
     first = jnp.arange(reflections, dtype=jnp.int32)
     once = first[:, None] == jnp.arange(settings.max_bends, dtype=jnp.int32)[None]
     choices = jnp.concatenate([jnp.zeros_like(once, shape=(1, settings.max_bends)), once])
-    paths = jax.vmap(lambda choice: follow_branch(scene, ray, choice, settings=settings))(choices)
+    known = None
+    if isinstance(scene.surfaces, LevelSet) and settings.reflections == "first":
+        # Only the main path is cast: a search along a level set costs many values.
+        found = find_primitives(scene, ray, choices[0], settings=settings)
+        at_first = jnp.arange(found.size, dtype=jnp.int32) == 0
+        reflected = jnp.where(at_first, found, NO_PRIMITIVE)
+        known = jnp.stack([found, *[reflected] * reflections])
+    follow = functools.partial(follow_branch, scene, ray, settings=settings, footprint=footprint)
+    paths = jax.vmap(lambda choice, found: follow(choice, primitives=found))(choices, known)
     # If the main path stays in its medium at a bend, reflection is total there.
     total = paths.media[0, 1:] == paths.media[0, :-1]
     if media.has_kinds(scene.interfaces):  # a thin sheet lets light through on the same side

@@ -111,8 +111,22 @@ class Interfaces(NamedTuple):
 class Scene(NamedTuple):
     """A scene: surfaces, and the interfaces between media at these surfaces."""
 
-    surfaces: surfaces.Surfaces
+    surfaces: surfaces.Surfaces | surfaces.LevelSet
     interfaces: Interfaces
+
+
+def meshes_of(scene: Scene) -> surfaces.Surfaces:
+    """Returns the surfaces of a scene that are meshes.
+
+    Raises:
+      TypeError: if its surface is a level set.
+    """
+    if isinstance(scene.surfaces, surfaces.LevelSet):
+        raise TypeError(
+            "The surface of this scene is a level set, which has no triangles. Extract its mesh, "
+            "or call a function that takes both, such as trace."
+        )
+    return scene.surfaces
 
 
 class Crossing(NamedTuple):

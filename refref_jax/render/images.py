@@ -21,12 +21,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from refref_jax import numerics
 from refref_jax.choices import side_of
 from refref_jax.compilation import runs_on_cpu
 from refref_jax.geometry import bvh
 from refref_jax.geometry.cameras import Cameras, box_filter, pixel_rays, supersample
 from refref_jax.geometry.rays import Rays
-from refref_jax.geometry.surfaces import Surfaces, surface_point
+from refref_jax.geometry.surfaces import LevelSet, Surfaces, closest, meet, surface_point
 from refref_jax.numerics import host_array
 from refref_jax.optics import light_paths, path_tracing
 from refref_jax.optics.light_paths import Branch, LightPaths, reflected_first
@@ -444,7 +445,9 @@ class FirstSurface(NamedTuple):
     parts: Int[np.ndarray, "*rays"]
 
 
-def find_first_surface(surfaces: Surfaces, rays: Rays, *, tile: int = CAST_TILE) -> FirstSurface:
+def find_first_surface(
+    surfaces: Surfaces | LevelSet, rays: Rays, *, tile: int = CAST_TILE
+) -> FirstSurface:
     """Casts rays and returns the first surface of each.
 
     Args:
@@ -470,8 +473,10 @@ def find_first_surface(surfaces: Surfaces, rays: Rays, *, tile: int = CAST_TILE)
 
 @jax.jit
 def _cast_tile(
-    surfaces: Surfaces, rays: Rays
+    surfaces: Surfaces | LevelSet, rays: Rays
 ) -> tuple[Float[Array, " rays"], Float[Array, "rays 3"], Int[Array, " rays"]]:
+    if isinstance(surfaces, LevelSet):
+        return jax.vmap(functools.partial(_meet_level_set, surfaces))(rays)
     limits = jnp.full_like(rays.radii, jnp.inf)
     exclude_primitive = jnp.full(rays.radii.shape, bvh.NO_PRIMITIVE, jnp.int32)
     hits = bvh.closest_hits(surfaces.bvh, rays, limits=limits, exclude_primitive=exclude_primitive)
@@ -481,3 +486,16 @@ def _cast_tile(
     )
     normals = jnp.where(found[:, None], points.shading_normal, 0.0)
     return hits.distances, normals, jnp.where(found, points.part, NO_PART)
+
+
+def _meet_level_set(
+    surface: LevelSet, ray: Rays
+) -> tuple[Float[Array, ""], Float[Array, "3"], Int[Array, ""]]:
+    """Returns distance, normal and part of the first hit of one ray."""
+    limit, nothing = jnp.full_like(ray.radii, jnp.inf), jnp.int32(bvh.NO_PRIMITIVE)
+    stretch = closest(surface, ray.origins, ray.directions, limit, nothing)
+    point = meet(surface, stretch, ray.origins, ray.directions)
+    found = stretch != bvh.NO_PRIMITIVE
+    distance = numerics.length(point.position - ray.origins)
+    normal = jnp.where(found, point.shading_normal, 0.0)
+    return jnp.where(found, distance, jnp.inf), normal, jnp.where(found, point.part, NO_PART)
