@@ -120,9 +120,10 @@ def level_set(
 ) -> LevelSet:
     """Returns the surface for light that is bent by it.
 
-    The slope is a central difference over two cells of the finest grid: its error is a third of
-    the squared cell times the third derivatives, not the cell times the second ones, as that of
-    four values. Refraction needs the direction of the slope, NeuS hardly more than its length.
+    Its slope is a central difference over two cells of the finest grid: the error is a sixth of the
+    squared cell times the third derivatives, not the cell times the second ones, as that of the
+    four values of NeuS. Refraction needs the direction of the slope, NeuS hardly more than its
+    length.
 
     Args:
       params: parameters of the field.
@@ -130,55 +131,31 @@ def level_set(
       centre: centre of the ball, world units.
       radius: radius of the ball, world units.
     """
-    placed = _Placed(config, centre, radius)
+    cell = 2.0 * radius / config.grid.max_res
     return LevelSet(
-        Partial(_Value(placed), params.surface),
-        Partial(_Slope(placed), params.surface),
-        jnp.asarray(centre, jnp.float32),
-        jnp.asarray(radius, jnp.float32),
+        Partial(_Values(config, centre, radius), params.surface),
+        *(jnp.asarray(x, jnp.float32) for x in (cell, centre, radius)),
     )
 
 
 @dataclasses.dataclass(frozen=True)
-class _Placed:
-    """Shape of a field with a surface, and the ball in world units."""
+class _Values:
+    """Signed values as a function that compares equal if its constants do, as `jit` needs.
+
+    Attributes:
+      config: shape of the field.
+      centre: centre of the ball, world units.
+      radius: radius of the ball, world units.
+    """
 
     config: SurfaceConfig
     centre: Position
     radius: float
 
-    def values(self, params: Params, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
-        """Returns signed values at points of the unit ball, in its radii."""
-        return evaluate(SignedValue(self.config), params, points)
-
-    def within(self, point: Float[Array, "3"]) -> Float[Array, "3"]:
-        """Returns the point of the unit ball at a point in world units."""
-        return (point - jnp.asarray(self.centre, point.dtype)) / self.radius
-
-
-@dataclasses.dataclass(frozen=True)
-class _Value:
-    """The signed value as a function that compares equal if its constants do, as `jit` needs."""
-
-    placed: _Placed
-
-    def __call__(self, params: Params, point: Float[Array, "3"]) -> Float[Array, ""]:
-        """Returns the signed value at a point, world units."""
-        return self.placed.radius * self.placed.values(params, self.placed.within(point)[None])[0]
-
-
-@dataclasses.dataclass(frozen=True)
-class _Slope:
-    """The slope of the signed value; see `_Value`."""
-
-    placed: _Placed
-
-    def __call__(self, params: Params, point: Float[Array, "3"]) -> Float[Array, "3"]:
-        """Returns the slope at a point in world units."""
-        step = 2.0 / self.placed.config.grid.max_res
-        offsets = step * jnp.concatenate([jnp.eye(3), -jnp.eye(3)]).astype(point.dtype)
-        values = self.placed.values(params, self.placed.within(point)[None] + offsets)
-        return (values[:3] - values[3:]) / (2.0 * step)
+    def __call__(self, params: Params, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
+        """Returns signed values at points, all in world units."""
+        within = (points - jnp.asarray(self.centre, points.dtype)[None]) / self.radius
+        return self.radius * evaluate(SignedValue(self.config), params, within)
 
 
 def _bending(size: FieldSize) -> FieldSize:

@@ -68,17 +68,16 @@ class Surfaces(NamedTuple):
 class LevelSet(NamedTuple):
     """A closed surface, in a ball, where a signed value is 0. It is the one part of its scene.
 
-    Both functions are pytrees, such as `jax.tree_util.Partial`, with the parameters as arrays.
-
     Attributes:
-      signed: function of a point, world units, that returns the value, negative inside.
-      slope: function of a point that returns the gradient of the value by position.
+      values: function of points `[n, 3]`, world units, that returns their values `[n]`, negative
+        inside; a pytree, such as `jax.tree_util.Partial`, with its parameters as arrays.
+      step: half of the distance of the points between which the slope is a difference, world units.
       centre: centre of the ball, world units.
       radius: radius of the ball, world units.
     """
 
-    signed: Callable[[Array], Array]
-    slope: Callable[[Array], Array]
+    values: Callable[[Array], Array]
+    step: Float[Array, ""]
     centre: Float[Array, "3"]
     radius: Float[Array, ""]
 
@@ -158,7 +157,7 @@ def closest(
         return closest_primitive(surfaces.bvh, origin, direction, limit, exclude)
     surfaces, origin, direction = jax.lax.stop_gradient((surfaces, origin, direction))
     edges = _edges(surfaces, origin, direction)
-    values = jax.vmap(lambda t: surfaces.signed(origin + t * direction))(edges)
+    values = _along(surfaces, origin, direction, edges)
     crosses = ((values[1:] > 0.0) != (values[:-1] > 0.0)) & (edges[:-1] < limit)
     crosses &= edges[-1] > edges[0]
     return jnp.where(jnp.any(crosses), jnp.argmax(crosses), NO_PRIMITIVE).astype(jnp.int32)
@@ -188,6 +187,29 @@ def meet(
     return surface_point(surfaces, primitive_id, barycentric)
 
 
+def slope(surface: LevelSet, point: Float[Array, "3"]) -> Float[Array, "3"]:
+    """Returns the slope of a level set's value at a point, by central differences."""
+    return _value_and_slope(surface, point)[1]
+
+
+def _value_and_slope(
+    surface: LevelSet, point: Float[Array, "3"]
+) -> tuple[Float[Array, ""], Float[Array, "3"]]:
+    axes = jnp.eye(3, dtype=point.dtype)
+    shifts = jnp.concatenate([jnp.zeros_like(axes[:1]), axes, -axes])
+    values = surface.values(point[None] + surface.step * shifts)
+    return values[0], (values[1:4] - values[4:]) / (2.0 * surface.step)
+
+
+def _along(
+    surface: LevelSet,
+    origin: Float[Array, "3"],
+    direction: Float[Array, "3"],
+    distances: Float[Array, " n"],
+) -> Float[Array, " n"]:
+    return surface.values(origin[None] + distances[:, None] * direction[None])
+
+
 def _edges(
     surface: LevelSet, origin: Float[Array, "3"], direction: Float[Array, "3"]
 ) -> Float[Array, " edges"]:
@@ -210,14 +232,15 @@ def _implicit_point(
     fixed, start, towards = jax.lax.stop_gradient((surface, origin, direction))
     t, enters = _crossing(fixed, stretch, start, towards)
     near = start + t * towards
-    slope = fixed.slope(near)
-    along = numerics.dot(slope, towards)
-    least = _GRAZING * numerics.length(slope)
+    value, steepest = _value_and_slope(surface, near)
+    fixed_slope = jax.lax.stop_gradient(steepest)
+    along = numerics.dot(fixed_slope, towards)
+    least = _GRAZING * numerics.length(fixed_slope)
     steep = jnp.where(enters, jnp.minimum(along, -least), jnp.maximum(along, least))
     moved = origin + t * direction - near
-    distance = t - numerics.safe_divide(surface.signed(near) + numerics.dot(slope, moved), steep)
+    distance = t - numerics.safe_divide(value + numerics.dot(fixed_slope, moved), steep)
     position = origin + distance * direction
-    normal = numerics.normalize(surface.slope(position))
+    normal = numerics.normalize(slope(surface, position))
     # A slope by differences may face the wrong way at grazing incidence: mirror it.
     facing = numerics.dot(normal, direction)
     wrong = (facing < 0.0) != enters
@@ -239,19 +262,16 @@ def _crossing(
     edges = _edges(surface, origin, direction)
     ends = edges[jnp.maximum(stretch, 0)], edges[jnp.maximum(stretch, 0) + 1]
 
-    def value(t: Float[Array, ""]) -> Float[Array, ""]:
-        return surface.signed(origin + t * direction)
-
     def narrow(_: Int[Array, ""], bracket: tuple[Array, Array, Array, Array]) -> tuple[Array, ...]:
         a, at_a, b, at_b = bracket
         c = jnp.clip(b - numerics.safe_divide(at_b * (b - a), at_b - at_a), *ends)
-        at_c = value(c)
+        at_c = _along(surface, origin, direction, c[None])[0]
         kept = jnp.sign(at_c) == jnp.sign(at_b)
         # An end that is kept twice counts half, or the bracket would shrink from one side only.
         a, at_a = jnp.where(kept, a, b), jnp.where(kept, 0.5 * at_a, at_b)
         return a, at_a, c, at_c
 
-    first, last = value(ends[0]), value(ends[1])
+    first, last = _along(surface, origin, direction, jnp.stack(ends))
     _, _, t, _ = jax.lax.fori_loop(0, _ROUNDS, narrow, (ends[0], first, ends[1], last))
     return t, first > 0.0
 

@@ -50,12 +50,15 @@ class _Segment(NamedTuple):
       medium: medium of the segment, known from the surface at its end, or else at its start.
       used: whether the path has this segment.
       primitive: triangle at its end, `NO_PRIMITIVE` if there is none.
+      aside: state of the ray that is partially reflected at its end, and whether there is one;
+        `None` if it is not asked for.
     """
 
     state: RayState
     medium: Int[Array, ""]
     used: Bool[Array, ""]
     primitive: Int[Array, ""]
+    aside: tuple[RayState, Bool[Array, ""]] | None = None
 
 
 class _Choice(NamedTuple):
@@ -167,6 +170,7 @@ def _scan(
     interior_list: Int[Array, " slots"] | None,
     footprint: Footprint,
     primitives: Int[Array, " casts"] | None,
+    aside: bool = False,
 ) -> tuple[_Walk, _Segment, Rays]:
     """Returns the end and the segments of one branch, and the ray in the scene's precision."""
     if reflects.shape[0] != settings.max_bends:
@@ -191,13 +195,13 @@ def _scan(
     )
     # One step more than max bends: the last one only checks whether the path escapes.
     choices = _Choice(jnp.append(reflects, False), primitives)
-    advance = functools.partial(_advance, scene, settings)
+    advance = functools.partial(_advance, scene, settings, aside=aside)
     end, segments = jax.lax.scan(advance, start, choices)
     return end, segments, ray
 
 
 def _advance(
-    scene: Scene, settings: PathSettings, walk: _Walk, choice: _Choice
+    scene: Scene, settings: PathSettings, walk: _Walk, choice: _Choice, *, aside: bool = False
 ) -> tuple[_Walk, _Segment]:
     """Casts the ray, then ends the path or follows one of the two branches."""
     state, alive = walk.state, walk.status == PathStatus.EMPTY
@@ -232,6 +236,8 @@ def _advance(
     medium = jnp.where(hit, sides.medium_near, walk.medium)
     segment = _Segment(state, medium, alive, primitive_id)
     going_on = status == PathStatus.EMPTY
+    if aside:
+        segment = segment._replace(aside=(branches.reflected, going_on & ~mirrored))
     return _either(going_on, bent, ended_walk), segment
 
 
@@ -324,15 +330,10 @@ def follow_main_branches(
     first = jnp.arange(reflections, dtype=jnp.int32)
     once = first[:, None] == jnp.arange(settings.max_bends, dtype=jnp.int32)[None]
     choices = jnp.concatenate([jnp.zeros_like(once, shape=(1, settings.max_bends)), once])
-    known = None
     if isinstance(scene.surfaces, LevelSet) and settings.reflections == "first":
-        # Only the main path is cast: a search along a level set costs many values.
-        found = find_primitives(scene, ray, choices[0], settings=settings)
-        at_first = jnp.arange(found.size, dtype=jnp.int32) == 0
-        reflected = jnp.where(at_first, found, NO_PRIMITIVE)
-        known = jnp.stack([found, *[reflected] * reflections])
+        return _main_and_first(scene, ray, choices[0], settings, reflections, footprint)
     follow = functools.partial(follow_branch, scene, ray, settings=settings, footprint=footprint)
-    paths = jax.vmap(lambda choice, found: follow(choice, primitives=found))(choices, known)
+    paths = jax.vmap(follow)(choices)
     # If the main path stays in its medium at a bend, reflection is total there.
     total = paths.media[0, 1:] == paths.media[0, :-1]
     if media.has_kinds(scene.interfaces):  # a thin sheet lets light through on the same side
@@ -342,3 +343,41 @@ def follow_main_branches(
         statuses=jnp.where(real, paths.statuses, PathStatus.EMPTY),
         throughput=jnp.where(real[:, None], paths.throughput, 0.0),
     )
+
+
+def _main_and_first(
+    scene: Scene,
+    ray: Rays,
+    ahead: Bool[Array, " bends"],
+    settings: PathSettings,
+    reflections: int,
+    footprint: Footprint,
+) -> LightPaths:
+    """Returns the main path, and its reflection at the first surface, with one search for each hit.
+
+    The reflected ray is not cast. A search along a level set takes many values, and every copy of
+    them in a program takes long to compile.
+    """
+    end, segments, ray = _scan(scene, ray, ahead, settings, None, footprint, None, aside=True)
+    main = _record(settings, ray, end, segments)
+    assert segments.aside is not None
+    aside, exists = jax.tree.map(lambda x: x[0], segments.aside)
+    second = jnp.arange(main.tau.size, dtype=jnp.int32) == 1
+
+    def placed(values: Array, new: Array) -> Array:
+        return jnp.where(second.reshape(-1, *[1] * new.ndim), new[None], values)
+
+    past = jnp.full_like(main.tau, jnp.inf)
+    reflected = main._replace(
+        points=placed(main.points, aside.point),
+        directions=placed(main.directions, aside.direction),
+        tau=placed(past.at[0].set(0.0), aside.tau),
+        ends=past.at[0].set(aside.tau),
+        media=jnp.where(second, main.media[0], main.media),
+        differentials=jax.tree.map(placed, main.differentials, aside.differential),
+        throughput=jnp.where(exists, aside.throughput, 0.0),
+        num_bends=jnp.where(exists, aside.num_bends, 0),
+        statuses=jnp.where(exists, PathStatus.NOT_TRACED, PathStatus.EMPTY).astype(jnp.int32),
+    )
+    both = [main, *[reflected] * reflections]
+    return jax.tree.map(lambda *each: jnp.stack(each), *both)

@@ -11,6 +11,7 @@ training shows what is lost by learning the surface; with those of a reconstruct
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -30,7 +31,7 @@ from refref_jax.fields.tnsr import TnsrConfig
 from refref_jax.geometry.bvh import LEAF_SIZE
 from refref_jax.geometry.cameras import Cameras
 from refref_jax.geometry.rays import Rays
-from refref_jax.geometry.surfaces import LevelSet, Surfaces
+from refref_jax.geometry.surfaces import LevelSet, Surfaces, slope
 from refref_jax.geometry.triangle_meshes import unit_vectors
 from refref_jax.numerics import host_array
 from refref_jax.optics import light_paths, media, path_tracing
@@ -301,7 +302,9 @@ def sums_of_hits(params: Params, model: ModelConfig, paths: LightPaths, key: Arr
     met = jnp.isfinite(paths.tau[:, 1:]) & light_paths.exists(paths)[:, None]
     cell = 2.0 * ball_of(model).radius / model.field.grid.max_res
     beside = points + cell * jax.random.uniform(key, points.shape, minval=-1.0)
-    here, there = (jax.vmap(jax.vmap(surface.slope))(x) for x in (points, beside))
+    pairs = jnp.stack([points, beside]).reshape(-1, 3)
+    slopes = jax.vmap(functools.partial(slope, surface))(pairs)
+    here, there = slopes.reshape(2, *points.shape)
     stretch = jnp.square(numerics.length(here) - 1.0)
     turn = jnp.sum(jnp.abs(numerics.normalize(here) - numerics.normalize(there)), axis=-1)
     values = stretch, turn, jnp.ones_like(stretch)
@@ -382,10 +385,10 @@ def sample_meshes(
 
 def distance_to_meshes(surface: LevelSet, samples: SurfaceSamples) -> Float[Array, ""]:
     """Returns the loss of a signed value: of values, in radii, and of slopes at the meshes."""
-    values = jax.vmap(surface.signed)(samples.points)
-    error = (values - samples.distances) / surface.radius
-    turned = jax.vmap(surface.slope)(samples.on_surface) - samples.normals
-    on = jax.vmap(surface.signed)(samples.on_surface) / surface.radius
+    both = jnp.concatenate([samples.points, samples.on_surface])
+    away, on = jnp.split(surface.values(both) / surface.radius, 2)
+    error = away - samples.distances / surface.radius
+    turned = jax.vmap(functools.partial(slope, surface))(samples.on_surface) - samples.normals
     return (
         jnp.mean(jnp.abs(error)) + 10.0 * jnp.mean(jnp.abs(on)) + 0.1 * jnp.mean(jnp.square(turned))
     )

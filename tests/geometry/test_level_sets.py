@@ -4,10 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.tree_util import Partial
 
 from refref_jax.geometry.bvh import NO_PRIMITIVE
-from refref_jax.geometry.surfaces import closest, meet
+from refref_jax.geometry.surfaces import closest, meet, slope
 from tests.factories import level_sets
 from tests.laws import gradients
 
@@ -77,7 +76,7 @@ def test_hits_of_a_ball_are_roots_of_its_quadratic(factor):
     distances = np.linalg.norm(points.position - origins, axis=-1)
     np.testing.assert_allclose(distances[met], exact[met], atol=1e-11)
     normals = (np.asarray(points.position) - _CENTRE) / _RADIUS
-    np.testing.assert_allclose(points.shading_normal[met], normals[met], atol=1e-11)
+    np.testing.assert_allclose(points.shading_normal[met], normals[met], atol=1e-8)
     assert gradients.all_finite(points)
 
 
@@ -148,12 +147,14 @@ def test_a_ray_from_the_surface_meets_its_other_side():
 
 def test_a_normal_that_faces_the_wrong_way_is_mirrored():
     """A slope by differences may be beyond grazing: the side is that of the values."""
-    surface = level_sets.ball(_CENTRE, _RADIUS)
-    slope = Partial(lambda x: surface.slope(x) + jnp.array([3.0, 0.0, 0.0]))
-    tilted = surface._replace(slope=slope)
-    origin = jnp.asarray(_CENTRE) + jnp.array([-0.3, 0.0, 3.0])
+
+    def values(points):  # a plane, with a slope that begins beside the point
+        return points[:, 2] + 20.0 * jax.nn.relu(points[:, 0] - 0.4)
+
+    coarse = level_sets.level_set(values)._replace(step=jnp.float64(0.5))
     direction = jnp.array([0.6, 0.0, -0.8])
-    point = _hit(tilted, origin, direction)[1]
-    assert jnp.dot(tilted.slope(point.position), direction) > 0.0
+    point = _hit(coarse, -direction, direction)[1]
+    np.testing.assert_allclose(point.position, 0.0, atol=1e-9)
+    assert jnp.dot(slope(coarse, point.position), direction) > 0.0
     assert jnp.dot(point.shading_normal, direction) < 0.0
     np.testing.assert_allclose(jnp.linalg.norm(point.shading_normal), 1.0, rtol=1e-12)
