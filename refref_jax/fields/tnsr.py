@@ -44,7 +44,7 @@ class TnsrConfig(SurfaceConfig):
       index: index of refraction inside the surface, relative to that outside; where it begins, if
         it is learned.
       index_from: whether the index is `given` or `learned`.
-      straight: share of the training in which light is straight, and the surface that of NeuS.
+      straight: share of the training in which rays are straight, and the surface is that of NeuS.
     """
 
     index: float = dataclasses.field(default=1.5, kw_only=True)
@@ -63,7 +63,8 @@ class TnsrConfig(SurfaceConfig):
             )
         if not 0.0 <= self.straight < 1.0:
             raise ValueError(
-                f"The share of straight light is {self.straight}. Give 0 or more, below 1."
+                f"The share of steps with straight rays is {self.straight}. Give 0 or more, below "
+                "1."
             )
 
 

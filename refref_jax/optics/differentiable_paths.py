@@ -3,7 +3,9 @@
 A path is a scan over the steps of `path_step`, for one ray along one branch of its tree. The search
 for the triangles that are hit has no gradients, but each hit point is recomputed from the corners
 of its triangle. Positions, directions, arc lengths and throughput of a path therefore have
-gradients with respect to indices of refraction, tints, absorption, corners, normals and the ray.
+gradients with respect to indices of refraction, tints, absorption, corners, normals and the ray. On
+a level set, stretches of the ray take the place of triangles (`surfaces.meet`), and the gradients
+are those with respect to its parameters.
 
 Gradients are those of a fixed path: the same triangles in the same order, and the same branches.
 They do not account for paths that move to another triangle or fall below the throughput threshold.
@@ -51,7 +53,7 @@ class _Segment(NamedTuple):
       used: whether the path has this segment.
       primitive: triangle at its end, `NO_PRIMITIVE` if there is none.
       aside: state of the ray that is partially reflected at its end, and whether there is one;
-        `None` if it is not asked for.
+        `None` if it is not needed.
     """
 
     state: RayState

@@ -476,14 +476,13 @@ def _cast_tile(
     surfaces: Surfaces | LevelSet, rays: Rays
 ) -> tuple[Float[Array, " rays"], Float[Array, "rays 3"], Int[Array, " rays"]]:
     if isinstance(surfaces, LevelSet):
-        return jax.vmap(functools.partial(_meet_level_set, surfaces))(rays)
+        return jax.vmap(_meet_level_set, in_axes=(None, 0))(surfaces, rays)
     limits = jnp.full_like(rays.radii, jnp.inf)
     exclude_primitive = jnp.full(rays.radii.shape, bvh.NO_PRIMITIVE, jnp.int32)
     hits = bvh.closest_hits(surfaces.bvh, rays, limits=limits, exclude_primitive=exclude_primitive)
     found = hits.primitive_ids != bvh.NO_PRIMITIVE
-    points = jax.vmap(surface_point, in_axes=(None, 0, 0))(
-        surfaces, hits.primitive_ids, hits.barycentrics
-    )
+    point = functools.partial(surface_point, surfaces)
+    points = jax.vmap(point)(hits.primitive_ids, hits.barycentrics)
     normals = jnp.where(found[:, None], points.shading_normal, 0.0)
     return hits.distances, normals, jnp.where(found, points.part, NO_PART)
 
@@ -496,6 +495,6 @@ def _meet_level_set(
     stretch = closest(surface, ray.origins, ray.directions, limit, nothing)
     point = meet(surface, stretch, ray.origins, ray.directions)
     found = stretch != bvh.NO_PRIMITIVE
-    distance = numerics.length(point.position - ray.origins)
+    distance = jnp.where(found, numerics.length(point.position - ray.origins), jnp.inf)
     normal = jnp.where(found, point.shading_normal, 0.0)
-    return jnp.where(found, distance, jnp.inf), normal, jnp.where(found, point.part, NO_PART)
+    return distance, normal, jnp.where(found, point.part, NO_PART)

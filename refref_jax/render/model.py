@@ -446,7 +446,7 @@ def bends_light(config: ModelConfig) -> bool:
 
 
 def opaque_model(config: ModelConfig) -> ModelConfig:
-    """Returns the model of the first part of the training, whose surface stops straight light."""
+    """Returns the model of the first part of the training, whose surface stops straight rays."""
     assert isinstance(config.field, SurfaceConfig)
     return dataclasses.replace(config, field=tnsr.opaque(config.field), interior="field")
 

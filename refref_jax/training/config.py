@@ -161,7 +161,7 @@ class FieldConfig:
       gaussians: Number of Gaussians, only of field=splats.
       splat_filter: Opacity of blurred Gaussians: reduced (mip) or kept (classic), of field=splats.
       surface_start: Initial surface of field=tnsr: a ball, or that of the scene's meshes.
-      straight_share: Share of the steps in which light is straight and the surface of field=tnsr
+      straight_share: Share of the steps in which rays are straight and the surface of field=tnsr
         opaque, in [0, 1); by default 0.5 from a ball, 0 from meshes.
       surface_index: Index of refraction of field=tnsr, relative to the medium around it; by default
         that of the scene's largest mesh, else 1.5.

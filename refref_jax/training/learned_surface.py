@@ -4,7 +4,7 @@ A field with a surface has it in a ball between the cameras (`place`). If it ben
 (`fields.tnsr`), paths cannot be traced in advance, since the surface changes with every step: each
 step turns its straight paths into bent ones (`bent`), with gradients. Samples of these paths are
 outside the surface, so that the losses of the surface are those of the points where light meets it
-(`sums_of_hits`). In the first part of the training, the surface stops straight light, as in NeuS.
+(`sums_of_hits`). In the first part of the training, the surface stops straight rays, as in NeuS.
 
 Instead of from a ball, a surface may begin from meshes (`fit`): with those of the scene, the
 training shows what is lost by learning the surface; with those of a reconstruction, it is refined.
@@ -214,11 +214,12 @@ def settings_of(config: TrainConfig) -> PathSettings:
 
 
 def total(
+    key: Array,
     params: Params,
     model: ModelConfig,
     straight: LightPaths,
     jitter: Jitter,
-    key: Array,
+    *,
     gather: Callable[..., Light],
     progress: Float[Array, ""] | None,
     config: TrainConfig,
@@ -226,11 +227,11 @@ def total(
     """Returns the sums over the paths of a batch; see `objective.total`.
 
     Args:
+      key: random key of the step.
       params: parameters of the model.
       model: configuration of the model, whose surface bends light after a first share of the steps.
       straight: straight paths of the batch.
       jitter: jitter of all paths through the surface.
-      key: random key of the step.
       gather: function of parameters, model, paths and jitter that returns their light.
       progress: progress of the training, 0 to 1.
       config: configuration of the run.
@@ -239,7 +240,7 @@ def total(
 
     def bend(params: Params) -> Totals:
         paths = bent(params, model, straight, settings=settings)
-        sums = sums_of_hits(params, model, paths, key)
+        sums = sums_of_hits(key, params, model, paths)
         light = gather(params, model, paths, jitter)
         return objective.total(
             light._replace(paths=light.paths._replace(surface=sums)), paths, losses
@@ -284,17 +285,17 @@ def bent(
     )
 
 
-def sums_of_hits(params: Params, model: ModelConfig, paths: LightPaths, key: Array) -> SurfaceSums:
+def sums_of_hits(key: Array, params: Params, model: ModelConfig, paths: LightPaths) -> SurfaceSums:
     """Returns sums over the points where paths meet a surface that bends light, for each path.
 
     In place of a curvature there is the change of the normal over a random distance, of up to a
     cell of the finest grid along each axis: the smoothness of TNSR.
 
     Args:
+      key: random key.
       params: parameters of the model.
       model: configuration of the model.
       paths: paths from `bent`.
-      key: random key.
     """
     surface = surface_scene(params, model).surfaces
     assert isinstance(surface, LevelSet) and isinstance(model.field, SurfaceConfig)

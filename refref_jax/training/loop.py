@@ -268,9 +268,8 @@ def _step(
 
     def sum_paths(params: Params) -> Totals:
         if bends_light(model):
-            return learned_surface.total(
-                params, model, traced.paths, jitter, key, gather, progress, config
-            )
+            through = key, params, model, traced.paths, jitter
+            return learned_surface.total(*through, gather=gather, progress=progress, config=config)
         light = gather(params, model, traced.paths, jitter)
         return objective.total(light, traced.paths, config.losses)
 

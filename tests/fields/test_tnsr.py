@@ -100,7 +100,7 @@ def test_an_index_is_learned_within_bounds():
     [
         ({"index": 1.0}, r"index of a surface is 1\.0\. Give a number from 1\.01 to 3"),
         ({"index": 7.0}, r"index of a surface is 7\.0"),
-        ({"straight": 1.0}, r"share of straight light is 1\.0\. Give 0 or more, below 1"),
+        ({"straight": 1.0}, r"share of steps with straight rays is 1\.0\. Give 0 or more, below 1"),
     ],
 )
 def test_wrong_shapes_are_refused(changes, message):

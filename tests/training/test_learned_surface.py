@@ -172,7 +172,7 @@ def test_options_follow_from_the_scene_and_the_start():
     [
         ({"paths": "straight"}, r"paths=straight cannot be combined with field=tnsr"),
         ({"interior": "field"}, r"interior=field cannot be combined with field=tnsr"),
-        ({"straight_share": 1.0}, r"share of straight light is 1\.0"),
+        ({"straight_share": 1.0}, r"share of steps with straight rays is 1\.0"),
         ({"surface_index": 0.5}, r"index of a surface is 0\.5"),
         ({"background": "unbounded"}, r"field=tnsr has a surface in a ball of the world"),
         ({"far_field": "backdrop"}, r"cannot model a surface \(field=neus, unisurf or tnsr\)"),
