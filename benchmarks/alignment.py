@@ -33,7 +33,7 @@ _TURNED = flags.DEFINE_list("turned", ["env_smcvx_pyramid"], "Scenes without an 
 _OUT = flags.DEFINE_string("out", None, "Folder to write to.", required=True)
 _SEED = flags.DEFINE_integer("seed", 0, "Seed of the directions of the errors.")
 
-_SPOILT = {"rotation of the object": 2.0, "size of the object": 3.0, "place of the object": 2.0}
+_PERTURBED = {"rotation of the object": 2.0, "size of the object": 3.0, "place of the object": 2.0}
 _DEGREES, _PERCENT = 0.1, 0.2
 
 # Smallest relative difference of moments of inertia that makes an axis.
@@ -70,13 +70,13 @@ def main(arguments: list[str]) -> None:
 
 
 def measure(folder: Path, out: Path) -> list[Placed]:
-    """Spoils and aligns the meshes of a scene."""
+    """Perturbs and aligns the meshes of a scene."""
     properties, name = scene_properties.read(folder), scene_names.of_folder(folder)
     true = tuple(meshes.read_meshes(folder, properties=properties))
     inputs = Inputs(true, scene_folder.read_frames(folder, "test"), properties)
-    for wrong, amount in _SPOILT.items():
+    for wrong, amount in _PERTURBED.items():
         generator = np.random.default_rng([_SEED.value, len(wrong)])
-        inputs = ERRORS[wrong].spoil(inputs, amount, generator)
+        inputs = ERRORS[wrong].perturb(inputs, amount, generator)
     place = out / name
     shutil.rmtree(place, ignore_errors=True)
     place.mkdir()

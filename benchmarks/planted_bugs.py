@@ -424,7 +424,7 @@ BUGS = (
     ),
     Bug(
         "rows of an image upwards",
-        "reconstruct/outlines.py",
+        "reconstruct/masks.py",
         "by_row = scale[:, None] * (-up + y[:, None] * back)",
         "by_row = scale[:, None] * (up + y[:, None] * back)",
         ("reconstruct/test_outlines.py",),

@@ -87,8 +87,8 @@ def measure(folder: Path, paths: str) -> list[Trial]:
     for wrong, error in ERRORS.items():
         trials.append(Trial(name, paths, wrong, error.unit, 0.0, right))
         for amount in error.amounts:
-            spoilt = error.spoil(inputs, amount, np.random.default_rng(_SEED.value))
-            found = _psnr(folder, spoilt, tree, settings, widen=wrong == "mask" and amount)
+            perturbed = error.perturb(inputs, amount, np.random.default_rng(_SEED.value))
+            found = _psnr(folder, perturbed, tree, settings, widen=wrong == "mask" and amount)
             trials.append(Trial(name, paths, wrong, error.unit, amount, found))
             print(f"  {wrong} off by {amount:g} {error.unit}: {found:.2f} dB", flush=True)
     return trials

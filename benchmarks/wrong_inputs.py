@@ -16,7 +16,7 @@ from refref_jax.data import scene_folder
 from refref_jax.data.meshes import MeshPart
 from refref_jax.data.scene_assembly import shaded_mesh
 from refref_jax.data.scene_properties import SceneProperties
-from refref_jax.reconstruct.outlines import rotation
+from refref_jax.reconstruct.masks import rotation
 
 _WAVES, _WAVELENGTH = 16, 0.25
 
@@ -35,12 +35,12 @@ class Error(NamedTuple):
     Attributes:
       unit: unit of its error.
       amounts: errors, in ascending order; the first is small.
-      spoil: function of the inputs, an error and a random generator to wrong inputs.
+      perturb: function of the inputs, an error and a random generator to wrong inputs.
     """
 
     unit: str
     amounts: tuple[float, ...]
-    spoil: Callable[[Inputs, float, np.random.Generator], Inputs]
+    perturb: Callable[[Inputs, float, np.random.Generator], Inputs]
 
 
 def _of_index(inputs: Inputs, amount: float, draw: np.random.Generator) -> Inputs:

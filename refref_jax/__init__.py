@@ -31,12 +31,12 @@ if TYPE_CHECKING:  # the same names for static type checkers; a test compares bo
     from refref_jax.optics.differentiable_paths import follow_main_branches as follow_main_branches
     from refref_jax.optics.light_paths import LightPaths as LightPaths
     from refref_jax.optics.light_paths import PathStatus as PathStatus
+    from refref_jax.optics.media import Scene as Scene
+    from refref_jax.optics.media import of_channel as of_channel
+    from refref_jax.optics.media import with_index as with_index
     from refref_jax.optics.path_settings import PATH_PRESETS as PATH_PRESETS
     from refref_jax.optics.path_settings import PathSettings as PathSettings
     from refref_jax.optics.path_tracing import trace as trace
-    from refref_jax.optics.scene import Scene as Scene
-    from refref_jax.optics.scene import of_channel as of_channel
-    from refref_jax.optics.scene import with_index as with_index
     from refref_jax.training.config import TrainConfig as TrainConfig
     from refref_jax.training.evaluation import evaluate as evaluate
     from refref_jax.training.fit import fit as fit
@@ -52,7 +52,7 @@ _HOMES = {
     "MeshPart": "data.meshes",
     "PathStatus": "optics.light_paths",
     "Rays": "geometry.rays",
-    "Scene": "optics.scene",
+    "Scene": "optics.media",
     "SceneError": "data",
     "TrainConfig": "training.config",
     "assemble": "data.scene_assembly",
@@ -62,12 +62,12 @@ _HOMES = {
     "follow_main_branches": "optics.differentiable_paths",
     "image_rays": "geometry.cameras",
     "make_part": "data.scene_assembly",
-    "of_channel": "optics.scene",
+    "of_channel": "optics.media",
     "orbit": "geometry.cameras",
     "read_meshes": "data.meshes",
     "single_object": "data.scene_assembly",
     "trace": "optics.path_tracing",
-    "with_index": "optics.scene",
+    "with_index": "optics.media",
 }
 """Module that defines each public name."""
 

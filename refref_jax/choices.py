@@ -81,8 +81,14 @@ Paths = Literal["straight", "paper", "tree", "paper_no_reflection", "paper_no_ti
 PresetName = Literal["tiny", "small", "paper", "best"]
 """Sizes of a model and its training; see `training.presets`."""
 
-FieldName = Literal["zipnerf", "nerfacto", "msnerf", "neus", "unisurf", "splats"]
+FieldName = Literal["zipnerf", "nerfacto", "msnerf", "neus", "unisurf", "tnsr", "splats"]
 """Field kinds, the default first (`fields.registry`), and Gaussian splats, which have no field."""
+
+IndexFrom = Literal["given", "learned"]
+"""Source of the index of refraction of a learned surface; see `fields.neus.TnsrConfig`."""
+
+SurfaceStart = Literal["ball", "meshes"]
+"""Where a learned surface begins; see `training.config.FieldConfig`."""
 
 FarField = Literal["field", "backdrop"]
 """Model of the world behind the objects: the radiance field, or a surface (`render.backdrop`)."""

@@ -16,8 +16,8 @@ from jaxtyping import Array, Bool
 from benchmarks.ahead_of_time.programs import SCENE
 from refref_jax.geometry import bvh, bvh_nodes, traversal
 from refref_jax.optics import path_tracing, wavefront
+from refref_jax.optics.media import Scene
 from refref_jax.optics.path_step import RayState
-from refref_jax.optics.scene import Scene
 from refref_jax.training.config import TrainConfig, require
 from refref_jax.training.fit import prepare, read_pixels
 

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from refref_jax.optics.scene import Scene
+from refref_jax.optics.media import Scene
 from refref_jax.render.model import path_detail
 from refref_jax.training import fit, loop
 from refref_jax.training.config import TrainConfig, require

@@ -92,6 +92,7 @@ def _varied(name: str, label: str, *options: str, colours: tuple[Need, ...] = ()
 
 _STRAIGHT = ("--paths=straight",)
 _NEUS, _UNISURF = (*_STRAIGHT, "--field=neus"), (*_STRAIGHT, "--field=unisurf")
+_TNSR = ("--field=tnsr",)
 
 _ALL = (
     Method("straight", "Straight (Zip-NeRF)", "main", _STRAIGHT, (), False, "Zip-NeRF"),
@@ -106,6 +107,14 @@ _ALL = (
     ),
     Method("neus", "NeuS (our fields)", "baseline", _NEUS, requires=("walls",), published="NeuS"),
     Method("unisurf", "UNISURF (our fields)", "baseline", _UNISURF, requires=("walls",)),
+    Method("tnsr", "TNSR (our fields)", "baseline", _TNSR, ("meshes", "walls"), published="TNSR"),
+    Method(
+        "tnsr_true_start",
+        "TNSR from the true surface",
+        "baseline",
+        (*_TNSR, "--surface_start=meshes"),
+        ("meshes", "walls"),
+    ),
     Method(
         "splats",
         "Splats (MCMC)",

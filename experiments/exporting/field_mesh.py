@@ -21,7 +21,7 @@ from refref_jax.geometry.bvh import LEAF_SIZE
 from refref_jax.geometry.rays import Rays
 from refref_jax.geometry.surfaces import Surfaces, build_surfaces
 from refref_jax.geometry.triangle_meshes import unit_vectors, vertex_vectors
-from refref_jax.optics.scene import Scene
+from refref_jax.optics.media import Scene
 from refref_jax.reconstruct import grids
 from refref_jax.reconstruct.grids import Grid
 from refref_jax.render import Model, pixels

@@ -13,7 +13,7 @@ from experiments.r3f import object_source, records
 from refref_jax.data import meshes
 from refref_jax.data.scene_assembly import shaded_mesh
 from refref_jax.geometry.triangle_meshes import Mesh
-from refref_jax.optics.scene import Scene
+from refref_jax.optics.media import Scene
 from refref_jax.render.checkpoint_io import load_scene
 
 

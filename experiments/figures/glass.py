@@ -22,8 +22,8 @@ from refref_jax.data import meshes
 from refref_jax.geometry import cameras
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import light_paths, path_tracing
+from refref_jax.optics.media import Scene
 from refref_jax.optics.path_settings import PATH_PRESETS, PathSettings
-from refref_jax.optics.scene import Scene
 from refref_jax.render.images import find_first_surface
 from refref_jax.render.pixel_paths import PixelPaths, trace_pixel
 from refref_jax.sampling import scene_bounds

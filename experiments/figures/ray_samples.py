@@ -21,8 +21,8 @@ from refref_jax.geometry import cameras
 from refref_jax.geometry.cameras import Cameras
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import path_tracing
+from refref_jax.optics.media import Scene
 from refref_jax.optics.path_settings import PathSettings
-from refref_jax.optics.scene import Scene
 from refref_jax.render import Model, volume_rendering
 from refref_jax.render.model import ModelConfig, Params, path_detail
 from refref_jax.render.volume_rendering import Jitter

@@ -5,7 +5,7 @@
     {out}/light/*.ply            the aligned parts
     {out}/errors.png             pixels before and after
 
-Outlines of the masks come first (`reconstruct.outlines.fit_placement`), then the light refracted
+Outlines of the masks come first (`reconstruct.masks.fit_placement`), then the light refracted
 through the object, with all parts, indices and colours as they are given. Pixels that were not
 fitted judge each step, and the better placement is kept. Where the background is a field, outlines
 alone place the object.
@@ -33,8 +33,8 @@ from refref_jax.geometry.triangle_meshes import Mesh, diameter, volume
 from refref_jax.optics.interface_rules import NO_PARENT, nested
 from refref_jax.reconstruct import gauss_newton, model_selection
 from refref_jax.reconstruct.gauss_newton import Fit, Steps
+from refref_jax.reconstruct.masks import Outlines, PlacedObject, fit_placement, rotation
 from refref_jax.reconstruct.model_selection import Trial
-from refref_jax.reconstruct.outlines import Outlines, PlacedObject, fit_placement, rotation
 from refref_jax.reconstruct.photometry import Backdrop
 
 PLACEMENT, FIGURE = "placement.json", "errors.png"

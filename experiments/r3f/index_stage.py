@@ -28,7 +28,7 @@ from refref_jax.geometry.cameras import pixel_rays
 from refref_jax.geometry.surfaces import pack_meshes
 from refref_jax.geometry.triangle_meshes import Mesh
 from refref_jax.optics.interface_rules import NO_PARENT, nested
-from refref_jax.optics.scene import Scene
+from refref_jax.optics.media import Scene
 from refref_jax.reconstruct.photometry import Backdrop, Photographs, make_backdrop
 from refref_jax.reconstruct.refractive_index import (
     Evidence,

@@ -27,9 +27,8 @@ from refref_jax.data.scene_assembly import assemble_scene, read_background
 from refref_jax.data.scene_properties import SceneProperties
 from refref_jax.geometry import cameras
 from refref_jax.geometry.rays import Rays
-from refref_jax.optics.media import interior_length
+from refref_jax.optics.media import Scene, interior_length
 from refref_jax.optics.path_settings import PathSettings
-from refref_jax.optics.scene import Scene
 from refref_jax.render import pixels
 from refref_jax.render.background_rendering import TILE, KnownRendering, render_known
 from refref_jax.render.backgrounds import Radiance, radiance_of

@@ -21,7 +21,7 @@ from experiments.cli import app
 from refref_jax import choices
 from refref_jax.data import scene_folder, scene_names
 from refref_jax.geometry.cameras import Cameras
-from refref_jax.optics.scene import Scene
+from refref_jax.optics.media import Scene
 from refref_jax.render import images as image_rendering
 from refref_jax.render import model
 from refref_jax.render.model import Model, Params

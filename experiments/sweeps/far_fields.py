@@ -7,7 +7,7 @@ from experiments.runs import config_flags
 from experiments.sweeps import table
 from experiments.sweeps.options import OF_EVALUATION
 from refref_jax.choices import FarField
-from refref_jax.optics.scene import Scene
+from refref_jax.optics.media import Scene
 from refref_jax.render.model import has_foreground
 from refref_jax.training import fit
 from refref_jax.training.config import BACKDROP_ONLY, FIELD_ONLY, TrainConfig

@@ -15,7 +15,7 @@ from experiments.viewer import cameras, session
 from experiments.viewer.session import Choice, Subject
 from refref_jax.geometry.bvh import LEAF_SIZE
 from refref_jax.geometry.cameras import Cameras
-from refref_jax.geometry.surfaces import Surfaces
+from refref_jax.geometry.surfaces import LevelSet, Surfaces
 from refref_jax.render.pixel_paths import Pieces
 
 _LOWEST, _HIGHEST, _STEP = 1.0, 2.5, 0.001
@@ -135,12 +135,12 @@ class Panel:
 class Scenery:
     """The nodes of one page's scene."""
 
-    def __init__(self, scene: Any, surfaces: Surfaces, views: Cameras | None) -> None:
+    def __init__(self, scene: Any, surfaces: Surfaces | LevelSet, views: Cameras | None) -> None:
         """Adds objects and cameras, hidden.
 
         Args:
           scene: 3D scene of the page.
-          surfaces: the objects' surfaces; they may have no triangle.
+          surfaces: the objects' surfaces; they may have no triangle, and a level set has none.
           views: the test cameras.
         """
         self._scene = scene
@@ -210,8 +210,10 @@ class Scenery:
         return nodes
 
 
-def triangles_by_part(surfaces: Surfaces) -> dict[int, Float[np.ndarray, "faces 3 3"]]:
+def triangles_by_part(surfaces: Surfaces | LevelSet) -> dict[int, Float[np.ndarray, "faces 3 3"]]:
     """Returns the triangles of each part that has any, without the padding of their tree."""
+    if isinstance(surfaces, LevelSet):
+        return {}
     corners = np.asarray(surfaces.bvh.triangles)[:-LEAF_SIZE]
     parts = np.asarray(surfaces.parts)[:-LEAF_SIZE]
     return {int(part): corners[parts == part] for part in np.unique(parts)}

@@ -28,8 +28,7 @@ from refref_jax.geometry.surfaces import pack_meshes
 from refref_jax.geometry.triangle_meshes import CREASE_ANGLE, Mesh, make_mesh
 from refref_jax.numerics import host_array
 from refref_jax.optics.interface_rules import RULES
-from refref_jax.optics.media import INDEX_OF_AIR
-from refref_jax.optics.scene import Scene
+from refref_jax.optics.media import INDEX_OF_AIR, Scene
 from refref_jax.render.backgrounds import (
     Background,
     CubeBackground,

@@ -70,7 +70,7 @@ _LARGEST = 1e9
 # Factor on the network's share of the signed value. Adam changes parameters by about the learning
 # rate, however small the gradient: without the factor, a common offset inflates the surface to the
 # ball before there are colours. (NeuS has a learning rate of 5e-4 instead, proposals 1e-2.)
-_PACE = 0.1
+PACE = 0.1
 
 # Bounds of the sharpness, as published.
 _SHARPNESS = (1e-6, 1e6)
@@ -153,11 +153,14 @@ class NeusParams(NamedTuple):
       around: parameters of the field around it.
       log_sharpness: natural logarithm of the sharpness; `None` of an occupancy, which has a fixed
         one.
+      index_change: change of the index of refraction of a surface that bends light
+        (`fields.tnsr`), if it is learned.
     """
 
     surface: Params
     around: Params
     log_sharpness: Float[Array, ""] | None
+    index_change: Float[Array, ""] | None = None
 
 
 def init_radiance(key: Array, config: SurfaceConfig) -> NeusParams:
@@ -167,7 +170,7 @@ def init_radiance(key: Array, config: SurfaceConfig) -> NeusParams:
     learned = None if isinstance(config, UnisurfConfig) else jnp.log(jnp.float32(config.sharpness))
     return NeusParams(
         _Surface(config).init(surface_key, nowhere, nowhere),
-        zipnerf.init_radiance(around_key, _around(config)),
+        zipnerf.init_radiance(around_key, around(config)),
         learned,
     )
 
@@ -193,7 +196,7 @@ def radiance(
     signed, steepest, curvature, rgb = evaluate(
         _Surface(config), params.surface, jnp.clip(position, -1.0, 1.0), direction
     )
-    outer = zipnerf.radiance(params.around, _around(config), gaussians, direction)
+    outer = zipnerf.radiance(params.around, around(config), gaussians, direction)
     behind = numerics.dot(position, direction) > 0.0
     density = jnp.where(behind, outer.density, 0.0)
     rgb = jnp.where(within, zipnerf.pad_colour(rgb), outer.rgb)
@@ -265,7 +268,7 @@ def unisurf_depth(
     return jnp.where(seen.within, within, seen.density * length)
 
 
-def _around(config: SurfaceConfig) -> zipnerf.RadianceFieldConfig:
+def around(config: SurfaceConfig) -> zipnerf.RadianceFieldConfig:
     """Returns the shape of the field around the ball."""
     return zipnerf.RadianceFieldConfig(
         config.around,
@@ -276,6 +279,37 @@ def _around(config: SurfaceConfig) -> zipnerf.RadianceFieldConfig:
         config.colour_network,
         precision=config.precision,
     )
+
+
+def _signed_values(
+    points: Float[Array, "n 3"], config: SurfaceConfig
+) -> tuple[Float[Array, " n"], Float[Array, "n width"]]:
+    """Returns signed values at points of the unit ball, and the hidden layer, in a module."""
+    layer = dense(config.precision)
+    every = nn.vmap(HashGrid, variable_axes={"params": None}, split_rngs={"params": False})
+    cells, scales = 0.5 * points + 0.5, jnp.zeros_like(points[:, 0])
+    features = every(config.grid, config.precision, name="grid")(cells, scales)
+    hidden = layer(config.density_width)(jnp.concatenate([features, points], axis=-1))
+    hidden = nn.softplus(hidden)
+    ball = numerics.length(points) - config.start
+    # Zero initial weights, so that the field starts as the ball alone.
+    change = layer(1, kernel_init=nn.initializers.zeros)(hidden)[:, 0]
+    return ball + PACE * change, hidden
+
+
+class SignedValue(nn.Module):
+    """Signed values at points of the unit ball, by `NeusParams.surface`.
+
+    Attributes:
+      config: shape of the field.
+    """
+
+    config: SurfaceConfig
+
+    @nn.compact
+    def __call__(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
+        """Returns the values; beyond the cube around the ball, those of its nearest points."""
+        return _signed_values(jnp.clip(points, -1.0, 1.0), self.config)[0]
 
 
 class _Surface(nn.Module):
@@ -291,16 +325,7 @@ class _Surface(nn.Module):
         layer = dense(config.precision)
         step = 2.0 / config.grid.max_res
         offsets = jnp.asarray([(0.0, 0.0, 0.0), *TETRAHEDRON], position.dtype)
-        points = position[None] + step * offsets
-        every = nn.vmap(HashGrid, variable_axes={"params": None}, split_rngs={"params": False})
-        cells, scales = 0.5 * points + 0.5, jnp.zeros_like(points[:, 0])
-        features = every(config.grid, config.precision, name="grid")(cells, scales)
-        hidden = layer(config.density_width)(jnp.concatenate([features, points], axis=-1))
-        hidden = nn.softplus(hidden)
-        ball = numerics.length(points) - config.start
-        # Zero initial weights, so that the field starts as the ball alone.
-        change = layer(1, kernel_init=nn.initializers.zeros)(hidden)[:, 0]
-        signed = ball + _PACE * change
+        signed, hidden = _signed_values(position[None] + step * offsets, config)
         steepest = slope(signed[1:], step=step)
         features = layer(config.bottleneck)(hidden[0])
         seen = jnp.concatenate([features, numerics.normalize(steepest)])

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 
 from jaxtyping import Array, Float
 
-from refref_jax.fields import msnerf, nerfacto, neus, zipnerf
+from refref_jax.fields import msnerf, nerfacto, neus, tnsr, zipnerf
 from refref_jax.fields.base import (
     Blend,
     DensityConfig,
@@ -27,6 +27,7 @@ KINDS: dict[str, FieldKind] = {
     "msnerf": msnerf.KIND,
     "neus": neus.KIND,
     "unisurf": neus.UNISURF,
+    "tnsr": tnsr.KIND,
 }
 
 USUAL = "zipnerf"
@@ -74,8 +75,8 @@ def has_sub_spaces(config: RadianceConfig) -> bool:
 
 
 def has_surface(config: RadianceConfig) -> bool:
-    """Returns whether a field has a surface, so that opacity depends on the path."""
-    return KINDS[config.kind].depth is not None
+    """Returns whether a field has a surface, which stops light or bends it."""
+    return KINDS[config.kind].eikonal is not None
 
 
 def init_density(key: Array, config: DensityConfig) -> Params:

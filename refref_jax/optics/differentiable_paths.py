@@ -3,7 +3,9 @@
 A path is a scan over the steps of `path_step`, for one ray along one branch of its tree. The search
 for the triangles that are hit has no gradients, but each hit point is recomputed from the corners
 of its triangle. Positions, directions, arc lengths and throughput of a path therefore have
-gradients with respect to indices of refraction, tints, absorption, corners, normals and the ray.
+gradients with respect to indices of refraction, tints, absorption, corners, normals and the ray. On
+a level set, stretches of the ray take the place of triangles (`surfaces.meet`), and the gradients
+are those with respect to its parameters.
 
 Gradients are those of a fixed path: the same triangles in the same order, and the same branches.
 They do not account for paths that move to another triangle or fall below the throughput threshold.
@@ -30,13 +32,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from refref_jax.choices import Footprint
-from refref_jax.geometry.bvh import NO_PRIMITIVE, closest_primitive
+from refref_jax.geometry.bvh import NO_PRIMITIVE
 from refref_jax.geometry.rays import Rays
+from refref_jax.geometry.surfaces import LevelSet, closest
 from refref_jax.optics import light_paths, media, path_step
 from refref_jax.optics.light_paths import LightPaths, PathStatus, Stop
+from refref_jax.optics.media import Scene, in_one_precision
 from refref_jax.optics.path_settings import PathSettings
 from refref_jax.optics.path_step import RayState
-from refref_jax.optics.scene import Scene, in_one_precision
 
 _Record = TypeVar("_Record")
 
@@ -49,12 +52,15 @@ class _Segment(NamedTuple):
       medium: medium of the segment, known from the surface at its end, or else at its start.
       used: whether the path has this segment.
       primitive: triangle at its end, `NO_PRIMITIVE` if there is none.
+      aside: state of the ray that is partially reflected at its end, and whether there is one;
+        `None` if it is not needed.
     """
 
     state: RayState
     medium: Int[Array, ""]
     used: Bool[Array, ""]
     primitive: Int[Array, ""]
+    aside: tuple[RayState, Bool[Array, ""]] | None = None
 
 
 class _Choice(NamedTuple):
@@ -166,6 +172,7 @@ def _scan(
     interior_list: Int[Array, " slots"] | None,
     footprint: Footprint,
     primitives: Int[Array, " casts"] | None,
+    aside: bool = False,
 ) -> tuple[_Walk, _Segment, Rays]:
     """Returns the end and the segments of one branch, and the ray in the scene's precision."""
     if reflects.shape[0] != settings.max_bends:
@@ -190,21 +197,21 @@ def _scan(
     )
     # One step more than max bends: the last one only checks whether the path escapes.
     choices = _Choice(jnp.append(reflects, False), primitives)
-    advance = functools.partial(_advance, scene, settings)
+    advance = functools.partial(_advance, scene, settings, aside=aside)
     end, segments = jax.lax.scan(advance, start, choices)
     return end, segments, ray
 
 
 def _advance(
-    scene: Scene, settings: PathSettings, walk: _Walk, choice: _Choice
+    scene: Scene, settings: PathSettings, walk: _Walk, choice: _Choice, *, aside: bool = False
 ) -> tuple[_Walk, _Segment]:
     """Casts the ray, then ends the path or follows one of the two branches."""
     state, alive = walk.state, walk.status == PathStatus.EMPTY
     reflect, primitive_id = choice
     if primitive_id is None:
         limit = jnp.where(alive & walk.traced, jnp.inf, -1.0).astype(state.tau.dtype)
-        primitive_id = closest_primitive(
-            scene.surfaces.bvh, state.origin, state.direction, limit, state.exclude_primitive
+        primitive_id = closest(
+            scene.surfaces, state.origin, state.direction, limit, state.exclude_primitive
         )
     hit = primitive_id != NO_PRIMITIVE
     arrival = path_step.arrive(scene, state, primitive_id)
@@ -231,13 +238,15 @@ def _advance(
     medium = jnp.where(hit, sides.medium_near, walk.medium)
     segment = _Segment(state, medium, alive, primitive_id)
     going_on = status == PathStatus.EMPTY
+    if aside:
+        segment = segment._replace(aside=(branches.reflected, going_on & ~mirrored))
     return _either(going_on, bent, ended_walk), segment
 
 
 def _no_stop(scene: Scene, ray: Rays) -> Stop | None:
     if not media.has_opaque(scene.interfaces):
         return None
-    known = scene.surfaces.radiance.shape[0] > 0
+    known = media.meshes_of(scene).radiance.shape[0] > 0
     infinite = jnp.full_like(ray.radii, jnp.inf)
     return Stop(infinite, jnp.zeros_like(ray.origins) if known else None)
 
@@ -269,7 +278,12 @@ def _record(settings: PathSettings, ray: Rays, end: _Walk, segments: _Segment) -
 
 
 def follow_main_branches(
-    scene: Scene, ray: Rays, *, settings: PathSettings, reflections: int
+    scene: Scene,
+    ray: Rays,
+    *,
+    settings: PathSettings,
+    reflections: int,
+    footprint: Footprint = "cone",
 ) -> LightPaths:
     """Traces one ray along its main path, and along the paths that are reflected once.
 
@@ -278,6 +292,7 @@ def follow_main_branches(
       ray: one camera ray.
       settings: path settings.
       reflections: number of first surfaces at which a reflection is followed.
+      footprint: `differential` carries derivatives across the pixel.
 
     Returns:
       `1 + reflections` paths, the main path first; paths that do not exist are `EMPTY`. Their ray
@@ -317,7 +332,10 @@ def follow_main_branches(
     first = jnp.arange(reflections, dtype=jnp.int32)
     once = first[:, None] == jnp.arange(settings.max_bends, dtype=jnp.int32)[None]
     choices = jnp.concatenate([jnp.zeros_like(once, shape=(1, settings.max_bends)), once])
-    paths = jax.vmap(lambda choice: follow_branch(scene, ray, choice, settings=settings))(choices)
+    if isinstance(scene.surfaces, LevelSet) and settings.reflections == "first":
+        return _main_and_first(scene, ray, choices[0], settings, reflections, footprint)
+    follow = functools.partial(follow_branch, scene, ray, settings=settings, footprint=footprint)
+    paths = jax.vmap(follow)(choices)
     # If the main path stays in its medium at a bend, reflection is total there.
     total = paths.media[0, 1:] == paths.media[0, :-1]
     if media.has_kinds(scene.interfaces):  # a thin sheet lets light through on the same side
@@ -327,3 +345,41 @@ def follow_main_branches(
         statuses=jnp.where(real, paths.statuses, PathStatus.EMPTY),
         throughput=jnp.where(real[:, None], paths.throughput, 0.0),
     )
+
+
+def _main_and_first(
+    scene: Scene,
+    ray: Rays,
+    ahead: Bool[Array, " bends"],
+    settings: PathSettings,
+    reflections: int,
+    footprint: Footprint,
+) -> LightPaths:
+    """Returns the main path, and its reflection at the first surface, with one search for each hit.
+
+    The reflected ray is not cast. A search along a level set takes many values, and every copy of
+    them in a program takes long to compile.
+    """
+    end, segments, ray = _scan(scene, ray, ahead, settings, None, footprint, None, aside=True)
+    main = _record(settings, ray, end, segments)
+    assert segments.aside is not None
+    aside, exists = jax.tree.map(lambda x: x[0], segments.aside)
+    second = jnp.arange(main.tau.size, dtype=jnp.int32) == 1
+
+    def placed(values: Array, new: Array) -> Array:
+        return jnp.where(second.reshape(-1, *[1] * new.ndim), new[None], values)
+
+    past = jnp.full_like(main.tau, jnp.inf)
+    reflected = main._replace(
+        points=placed(main.points, aside.point),
+        directions=placed(main.directions, aside.direction),
+        tau=placed(past.at[0].set(0.0), aside.tau),
+        ends=past.at[0].set(aside.tau),
+        media=jnp.where(second, main.media[0], main.media),
+        differentials=jax.tree.map(placed, main.differentials, aside.differential),
+        throughput=jnp.where(exists, aside.throughput, 0.0),
+        num_bends=jnp.where(exists, aside.num_bends, 0),
+        statuses=jnp.where(exists, PathStatus.NOT_TRACED, PathStatus.EMPTY).astype(jnp.int32),
+    )
+    both = [main, *[reflected] * reflections]
+    return jax.tree.map(lambda *each: jnp.stack(each), *both)

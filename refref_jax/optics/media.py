@@ -1,4 +1,7 @@
-"""Media on both sides of the interfaces that a ray crosses.
+"""Scenes for path tracing, and the media on both sides of the interfaces that a ray crosses.
+
+A `Scene` has surfaces, and at each of them an interface between two media. Its index can be changed
+without a rebuild.
 
 Every part is the boundary of an object. A *medium* is identified by an integer: 0 is the ambient
 medium, usually air (`AMBIENT`), `1 + k` is the inside of part `k`.
@@ -20,8 +23,8 @@ medium of the ray that meets them surrounds them, on both sides. They may be any
 liquid and half in air. Where a scene has such parts, rays carry an interior list, which determines
 this medium, under every rule.
 
-A ray of a scene with dispersion carries light of one colour channel only, and `of_channel` gives
-the indices that it meets.
+A ray of a scene with dispersion carries light of one colour channel only, and
+`interfaces_of_channel` gives the indices that it meets.
 
 The list is an unordered array of `SLOTS` part indices, `EMPTY_SLOT` where free, and its updates are
 branch-free. The side of a surface that a ray comes from determines whether the ray is inside that
@@ -34,14 +37,19 @@ Tools 7 (2002).
 """
 
 import functools
-from typing import NamedTuple, get_args
+from typing import NamedTuple, TypeVar, get_args
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax import numerics
 from refref_jax.choices import PartKind
+from refref_jax.geometry import surfaces
+from refref_jax.geometry.rays import Rays
+
+_Tree = TypeVar("_Tree")
 
 KINDS: tuple[PartKind, ...] = get_args(PartKind)
 """Kinds of parts, in the order of their numbers in `Interfaces.kinds`."""
@@ -100,6 +108,27 @@ class Interfaces(NamedTuple):
     index_by_channel: Float[Array, "channels 2 parts"]
 
 
+class Scene(NamedTuple):
+    """A scene: surfaces, and the interfaces between media at these surfaces."""
+
+    surfaces: surfaces.Surfaces | surfaces.LevelSet
+    interfaces: Interfaces
+
+
+def meshes_of(scene: Scene) -> surfaces.Surfaces:
+    """Returns the surfaces of a scene that are meshes.
+
+    Raises:
+      TypeError: if its surface is a level set.
+    """
+    if isinstance(scene.surfaces, surfaces.LevelSet):
+        raise TypeError(
+            "The surface of this scene is a level set, which has no triangles. Extract its mesh, "
+            "or call a function that takes both, such as trace."
+        )
+    return scene.surfaces
+
+
 class Crossing(NamedTuple):
     """The two sides of an interface, as seen by a ray.
 
@@ -144,7 +173,7 @@ def has_dispersion(interfaces: Interfaces) -> bool:
     return interfaces.index_by_channel.shape[0] > 0
 
 
-def of_channel(interfaces: Interfaces, channel: Int[Array, ""]) -> Interfaces:
+def interfaces_of_channel(interfaces: Interfaces, channel: Int[Array, ""]) -> Interfaces:
     """Returns interfaces without dispersion: those that light of one channel meets.
 
     Args:
@@ -313,3 +342,96 @@ def _index(
 ) -> Float[Array, ""]:
     index = interfaces.index_inside[jnp.maximum(medium - 1, 0)]
     return jnp.where(medium == AMBIENT, ambient, index)
+
+
+def with_index(scene: Scene, index: Float[ArrayLike, ""], *, part: int = 0) -> Scene:
+    """Returns a scene in which one part has another index of refraction.
+
+    The outer index of parts directly inside this part changes too, except under the rule `facing`,
+    where air is outside every part. Differentiable; no array shape changes, so that functions
+    compiled for one index work for all.
+
+    Args:
+      scene: the scene.
+      index: index of refraction, relative to air.
+      part: index of the part, in the order in which the parts were given; the parts of a scene
+        folder are ordered by name.
+
+    Raises:
+      ValueError: if the part does not exist, or the scene has dispersion.
+
+    Example:
+      >>> import trimesh
+      >>> import refref_jax
+      >>> box = refref_jax.single_object(trimesh.creation.box(), index=1.5)
+      >>> float(refref_jax.with_index(box, 1.25).interfaces.index_inside[0])
+      1.25
+    """
+    if has_dispersion(scene.interfaces):
+        raise ValueError(
+            "The scene has dispersion: its indices differ between red, green and blue. Take one "
+            "colour first, with of_channel."
+        )
+    new = jnp.asarray(index)
+    interfaces = jax.tree.map(jnp.asarray, scene.interfaces)
+    # A Python number has no precision of its own.
+    decisive = interfaces if new.weak_type else (interfaces, new)
+    interfaces = _in_precision(_highest(decisive), interfaces)
+    parts = interfaces.index_inside.shape[0]
+    if not 0 <= part < parts:
+        raise ValueError(
+            f"part is {part}, but the number of parts is {parts}. Give 0 to {parts - 1}."
+        )
+    new = new.astype(interfaces.index_inside.dtype)
+    had = interfaces.index_outside == interfaces.index_inside[part]
+    around = (interfaces.medium_outside == 1 + part) & had
+    changed = interfaces._replace(
+        index_inside=interfaces.index_inside.at[part].set(new),
+        index_outside=jnp.where(around, new, interfaces.index_outside),
+    )
+    return scene._replace(interfaces=changed)
+
+
+def of_channel(scene: Scene, channel: int) -> Scene:
+    """Returns a scene without dispersion, with the indices of one colour channel.
+
+    Args:
+      scene: the scene.
+      channel: 0 for red, 1 for green, 2 for blue; all are equal in a scene without dispersion.
+
+    Example:
+      >>> import trimesh
+      >>> import refref_jax
+      >>> flint = refref_jax.Material(dispersion=(1.61, 1.62, 1.64))
+      >>> prism = refref_jax.make_part(trimesh.creation.box(), index=1.62, material=flint)
+      >>> blue = refref_jax.of_channel(refref_jax.assemble([prism]), 2)
+      >>> print(f"{blue.interfaces.index_inside[0]:.2f}")
+      1.64
+    """
+    if not has_dispersion(scene.interfaces):
+        return scene
+    return scene._replace(interfaces=interfaces_of_channel(scene.interfaces, jnp.int32(channel)))
+
+
+def in_one_precision(scene: Scene, rays: Rays) -> tuple[Scene, Rays]:
+    """Converts a scene and rays to JAX arrays, all in the highest precision that one of them has.
+
+    Scenes are built in single precision, so rays in double precision are traced in double
+    precision through corners that were rounded to single precision.
+    """
+    both = jax.tree.map(jnp.asarray, (scene, rays))
+    return _in_precision(_highest(both), both)
+
+
+def _highest(tree: _Tree) -> DTypeLike:
+    """Returns the widest real data type in a pytree of arrays."""
+    kinds = {x.dtype for x in jax.tree.leaves(tree) if _is_real(x)}
+    return max(kinds, key=lambda each: each.itemsize)
+
+
+def _in_precision(kind: DTypeLike, tree: _Tree) -> _Tree:
+    return jax.tree.map(lambda x: x.astype(kind) if _is_real(x) else x, tree)
+
+
+def _is_real(array: Array) -> bool:
+    return jnp.issubdtype(array.dtype, jnp.floating)

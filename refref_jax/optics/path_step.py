@@ -18,13 +18,13 @@ from jaxtyping import Array, Bool, Float, Int
 from refref_jax import numerics
 from refref_jax.geometry import surfaces
 from refref_jax.geometry.bvh import NO_PRIMITIVE
-from refref_jax.geometry.rays import Rays, intersect
+from refref_jax.geometry.rays import Rays
 from refref_jax.geometry.surfaces import SurfacePoint
 from refref_jax.optics import fresnel, light_paths, media
 from refref_jax.optics.fresnel import Stratum
 from refref_jax.optics.light_paths import Bend, PathStatus, RayDifferential, Stop
+from refref_jax.optics.media import Scene
 from refref_jax.optics.path_settings import PathSettings
-from refref_jax.optics.scene import Scene
 
 
 class Interaction(NamedTuple):
@@ -291,22 +291,19 @@ def arrive(scene: Scene, state: RayState, primitive_id: Int[Array, ""]) -> Arriv
     """Advances a ray to the triangle that it hits; finite but meaningless for `NO_PRIMITIVE`.
 
     The hit point is recomputed from the corners of the triangle, so it has gradients and the
-    precision of the corners rather than that of the BVH traversal.
+    precision of the corners rather than that of the BVH traversal. On a level set, a stretch of the
+    ray takes the place of the triangle (`surfaces.meet`).
     """
     interfaces, stratum = scene.interfaces, None
     if state.strata is not None:
         stratum = Stratum(state.strata[0], state.strata[1], state.strata[2], state.num_bends)
     if media.has_dispersion(interfaces):  # the ray carries light of one channel
-        interfaces = media.of_channel(interfaces, jnp.argmax(state.throughput))
+        interfaces = media.interfaces_of_channel(interfaces, jnp.argmax(state.throughput))
 
     def surface(
         origin: Float[Array, "3"], direction: Float[Array, "3"], tilt: Float[Array, "2"] | None
     ) -> tuple[Bend, Interaction]:
-        corners = scene.surfaces.bvh.triangles[primitive_id]
-        found = intersect(origin, direction, corners).barycentric
-        # A ray without a hit reads an arbitrary triangle: keep it out of values and gradients.
-        barycentric = jnp.where(primitive_id == NO_PRIMITIVE, 1.0 / 3.0, found)
-        point = surfaces.surface_point(scene.surfaces, primitive_id, barycentric)
+        point = surfaces.meet(scene.surfaces, primitive_id, origin, direction)
         # Otherwise XLA would gather the triangle again for every result that depends on it.
         point = jax.lax.optimization_barrier(point)
         met = interact(
@@ -317,7 +314,7 @@ def arrive(scene: Scene, state: RayState, primitive_id: Int[Array, ""]) -> Arriv
     # The ray stands for the facets between it and the other rays of its pixel, too.
     tilts = None
     if stratum is not None and interfaces.alpha.shape[0]:
-        part = scene.surfaces.parts[primitive_id]
+        part = media.meshes_of(scene).parts[primitive_id]
         tilts = fresnel.spacing(interfaces.alpha[part], stratum)
     met, reflected, transmitted = light_paths.bend(
         surface, state.origin, state.direction, state.differential, tilts=tilts

@@ -10,9 +10,13 @@ and the scene do not, and differentiating with respect to these is an error (use
 In a scene with dispersion, each ray is traced three times, for red, green and blue light with its
 own indices; the throughput of a path is then 0 in two channels. Other scenes have one trace.
 
+A scene whose surface is a level set has no wavefront: its rays follow their main branches
+(`differentiable_paths`), with gradients. The rest of their light is dropped, and counted as such.
+
 Source: paper (arXiv 2505.05848), section 4.2. Symbols as in `light_paths`.
 """
 
+import functools
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -21,18 +25,24 @@ from jaxtyping import Array, Float, Int
 
 from refref_jax.choices import Footprint
 from refref_jax.geometry.rays import Rays
+from refref_jax.geometry.surfaces import LevelSet
 from refref_jax.optics import media, path_settings, path_tree
+from refref_jax.optics.differentiable_paths import follow_main_branches
 from refref_jax.optics.light_paths import (
     LightPaths,
     PathEnds,
     PathStatus,
+    ends_of,
     exists,
     straight,
     straight_ends,
 )
+from refref_jax.optics.media import Scene, in_one_precision
 from refref_jax.optics.path_settings import Detail, PathSettings, capacities
-from refref_jax.optics.scene import Scene, in_one_precision
 from refref_jax.optics.wavefront import follow
+
+# Largest number of reflections that are followed at a level set.
+_MOST_REFLECTIONS = 3
 
 
 class Traced(NamedTuple):
@@ -104,6 +114,10 @@ def trace_ends(
     if _needs_no_tracing(rays, settings):
         lines = straight_ends(rays, footprint=footprint)
         return TracedEnds(lines, jnp.zeros_like(rays.origins), jnp.zeros((), jnp.int32))
+    if isinstance(scene.surfaces, LevelSet):
+        paths, lost = trace_level_set(scene, rays, settings=settings, footprint=footprint)
+        casts = rays.radii.size * (settings.max_bends + 1)
+        return TracedEnds(ends_of(paths), lost, jnp.int32(casts))
     interior_list = _inside(scene, rays, interior_list)
     times = _traces(scene)
     if times > 1:
@@ -200,6 +214,11 @@ def trace_batches(
     scene, rays = in_one_precision(scene, rays)
     if _needs_no_tracing(rays, settings):
         return jax.vmap(lambda batch: Traced(straight(batch), jnp.zeros_like(batch.origins)))(rays)
+    if isinstance(scene.surfaces, LevelSet):
+        carried = detail.footprint if detail else "cone"
+        return jax.vmap(
+            lambda batch: trace_level_set(scene, batch, settings=settings, footprint=carried)
+        )(rays)
     (batches, count), times = rays.radii.shape, _traces(scene)
     count *= times
     capacity = capacities(settings, count).paths if capacity is None else capacity
@@ -224,6 +243,43 @@ def trace_batches(
     paths = jax.tree.map(lambda x: x.reshape(batches, capacity, *x.shape[1:]), paths)
     traced = Traced(paths._replace(rays=paths.rays % count), dropped.reshape(batches, count, 3))
     return traced if times == 1 else _of_one_ray(traced, times)
+
+
+def branches_of(settings: PathSettings) -> int:
+    """Returns the number of paths of a ray in a scene whose surface is a level set."""
+    most = {"none": 0, "first": 1, "all": _MOST_REFLECTIONS}[settings.reflections]
+    return 1 + min(most, settings.max_bends)
+
+
+def trace_level_set(
+    scene: Scene, rays: Rays, *, settings: PathSettings, footprint: Footprint = "cone"
+) -> Traced:
+    """Traces a batch of rays along their main branches, with gradients.
+
+    Args:
+      scene: scene whose surface is a level set.
+      rays: camera rays.
+      settings: path settings.
+      footprint: `differential` carries derivatives across the pixel.
+
+    Returns:
+      `branches_of(settings)` paths of each ray, with all segments; those that do not exist are
+      empty.
+    """
+    count, branches = rays.radii.shape[0], branches_of(settings)
+    follow = functools.partial(
+        follow_main_branches,
+        scene,
+        settings=settings,
+        reflections=branches - 1,
+        footprint=footprint,
+    )
+    paths = jax.tree.map(
+        lambda x: x.reshape(count * branches, *x.shape[2:]), jax.vmap(follow)(rays)
+    )
+    paths = paths._replace(rays=jnp.repeat(jnp.arange(count, dtype=jnp.int32), branches))
+    total = jnp.sum(paths.throughput.reshape(count, branches, 3), axis=1)
+    return Traced(paths, jnp.maximum(1.0 - total, 0.0))
 
 
 def survey(scene: Scene, rays: Rays, *, settings: PathSettings) -> Survey:

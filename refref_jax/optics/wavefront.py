@@ -30,6 +30,7 @@ from refref_jax.geometry import bvh
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import light_paths, media, path_settings, path_step, path_tree
 from refref_jax.optics.light_paths import PathStatus, Stop
+from refref_jax.optics.media import Scene
 from refref_jax.optics.path_settings import Capacities, PathSettings
 from refref_jax.optics.path_step import Arrival, Branches, RayState
 from refref_jax.optics.path_tree import (
@@ -41,7 +42,6 @@ from refref_jax.optics.path_tree import (
     Segments,
     join,
 )
-from refref_jax.optics.scene import Scene
 
 StoredSegments = Literal["all", "last"]
 
@@ -390,7 +390,7 @@ def _no_stop(scene: Scene, state: RayState) -> Stop | None:
     """Returns stops for a list of paths that end nowhere; none without opaque parts."""
     if not media.has_opaque(scene.interfaces):
         return None
-    known = scene.surfaces.radiance.shape[0] > 0
+    known = media.meshes_of(scene).radiance.shape[0] > 0
     return Stop(
         jnp.full_like(state.tau, jnp.inf), jnp.zeros_like(state.throughput) if known else None
     )
@@ -462,7 +462,7 @@ def _trace_block(
 
 def _cast(scene: Scene, state: RayState, alive: Bool[Array, " block"]) -> bvh.Hits:
     return bvh.closest_hits(
-        scene.surfaces.bvh,
+        media.meshes_of(scene).bvh,
         Rays(state.origin, state.direction, jnp.zeros_like(state.tau)),
         limits=jnp.where(alive, jnp.inf, -1.0).astype(state.tau.dtype),
         exclude_primitive=state.exclude_primitive,

@@ -1,4 +1,4 @@
-"""Turns masks into signed distances in the image, with subpixel accuracy (NumPy only).
+"""Masks as signed distances in the image, with subpixel accuracy, and their outlines (NumPy only).
 
 A mask states for each pixel centre whether the object is visible there, so the outline is known to
 half a pixel, as a staircase. Averaging the signed distances to its steps over a neighbourhood is
@@ -9,16 +9,40 @@ subtracted, which preserves every quadratic: discs keep their size, and corners 
 Errors measured on discs with a radius of 34 pixels and on squares at all angles, in pixels: steps
 alone 0.23 RMS; blur 1.5: 0.14 RMS, mean below 0.01, corners cut back by 0.5; blur 3: 0.10, 0.01 and
 1.0.
+
+`Outlines` are equations of the masks' outlines, for `gauss_newton`. Where the surface turns away
+from a camera, its image has an edge, and the edge of the mask should be there. A point of this rim
+that moves by `dx` moves its image across the edge by
+`d (signed distance) / d pixel . d pixel / d point . dx`; moving along the line of sight changes
+nothing. Masks are sampled at the centres of pixels, so the distance of a point has an error of
+about a third of a pixel. Masks that are wrong, or show something else, lose their weight.
+
+`fit_profile` fits a body of revolution to outlines alone. A mesh from masks is up to half a pixel
+too narrow and has waves along its profile; the outlines of all views together determine it to some
+hundredths of a pixel, and its normals to half a degree. `fit_placement` moves, turns and scales an
+object of known shape until its outlines are those of the masks.
+
+Source: Cipolla and Blake, Surface Shape from the Deformation of Apparent Contours (1992), for the
+derivative; its use beside refraction is ours.
 """
 
+import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy.sparse
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt, gaussian_filter, gaussian_laplace
 
-from refref_jax.geometry.cameras import Cameras
+from refref_jax.geometry.cameras import Cameras, project
+from refref_jax.geometry.triangle_meshes import Mesh, diameter, unit_vectors
+from refref_jax.optics.media import Interfaces
 from refref_jax.reconstruct import ReconstructionError
+from refref_jax.reconstruct.families import Revolution
+from refref_jax.reconstruct.gauss_newton import Candidate, Rows
+from refref_jax.reconstruct.relief import Relief
+from refref_jax.reconstruct.shapes import LARGEST_STEP, LARGEST_TURN, Posed
 
 BLUR = 1.5
 """Standard deviation of the average over an outline, pixels."""
@@ -124,3 +148,347 @@ def _listed(views: Int[np.ndarray, " views"]) -> str:
     """Returns the numbers of the first few views, as text."""
     names = ", ".join(str(view) for view in views[:5])
     return f"Views {names}{', ...' if len(views) > 5 else ''}: {len(views)}"
+
+
+# Standard deviation of a signed distance, and the distance at which a point has lost half of its
+# weight, in pixels; points that are further away are of an inner edge, which a mask does not show.
+_DEVIATION, _WRONG, _FURTHEST = 0.3, 1.0, 3.0
+
+# Largest number of rim points per view: neighbours have the same error, so more add nothing.
+_POINTS = 100
+
+# Steps of the fit of a profile, and the standard deviation of the second differences of its knots,
+# as a share of the diameter: neighbouring points have errors that are alike.
+_ROUNDS, _BEND = 5, 0.001
+
+# Steps of the fit of a placement, and the change, relative to the scales of the unknowns, that ends
+# it; standard deviations of its prior: radians, shares of the diameter, logarithm of the size.
+_PLACEMENT_ROUNDS, _PLACED = 30, 1e-4
+_TURN, _SHIFT, _GROWTH = 0.2, 0.1, 0.2
+
+# Largest error of a body with a relief, as a share of that of the body without it.
+_BETTER = 0.95
+
+
+class _Rim(NamedTuple):
+    """Points between two vertices, where the surface turns away from a camera.
+
+    Attributes:
+      first: vertex at one end.
+      second: vertex at the other end.
+      share: share of the second vertex.
+    """
+
+    first: Int[np.ndarray, " points"]
+    second: Int[np.ndarray, " points"]
+    share: Float[np.ndarray, " points"]
+
+
+class Outlines:
+    """The outlines of masks, as a function of a candidate to `Rows`."""
+
+    def __init__(
+        self, views: Views, *, common: float = 0.0, seed: int = 0, reach: float = _FURTHEST
+    ) -> None:
+        """Measures the signed distances of all masks.
+
+        Args:
+          views: masks and their cameras.
+          common: standard deviation, in pixels, of how much too wide all masks are.
+          seed: seed of the draws of rim points.
+          reach: distance from an outline beyond which points have no say, pixels.
+        """
+        self._cameras, self._common, self._seed = views.cameras, common, seed
+        self._reach = reach
+        self._distances = [
+            signed_distances(mask).astype(np.float32) if mask.any() and not mask.all() else None
+            for mask in views.masks
+        ]
+
+    def __call__(self, candidate: Candidate) -> Rows:
+        """Returns the equations of the outline of the first part, which contains all others."""
+        return self.of_surface(candidate.parts[0])
+
+    def of_surface(self, part: Posed) -> Rows:
+        """Returns the equations of the outline of a surface."""
+        normals = _vertex_normals(part)
+        edges = _edges(part.faces)
+        generator = np.random.default_rng(self._seed)
+        found = [
+            self._of_view(view, distances, part, normals, edges, generator)
+            for view, distances in enumerate(self._distances)
+            if distances is not None
+        ]
+        errors = np.concatenate([each[0] for each in found])
+        derivatives = scipy.sparse.vstack([each[1] for each in found]).tocsr()
+        wrong = _WRONG * self._reach / _FURTHEST
+        weights = 1.0 / (1.0 + (errors * _DEVIATION / wrong) ** 2) ** 2
+        return Rows(errors, derivatives @ part.by_vertices, weights, self._common / _DEVIATION)
+
+    def of_surfaces(self, parts: Sequence[Posed]) -> Rows:
+        """Returns the equations of the outlines of surfaces that depend on the same unknowns."""
+        each = [self.of_surface(part) for part in parts]
+        return Rows(
+            np.concatenate([rows.errors for rows in each]),
+            np.concatenate([rows.derivatives for rows in each]),
+            np.concatenate([rows.weights for rows in each]),
+            each[0].common,
+        )
+
+    def _of_view(
+        self,
+        view: int,
+        distances: Float[np.ndarray, "h w"],
+        part: Posed,
+        normals: Float[np.ndarray, "vertices 3"],
+        edges: Int[np.ndarray, "edges 2"],
+        generator: np.random.Generator,
+    ) -> tuple[Float[np.ndarray, " points"], scipy.sparse.csr_array]:
+        """Returns errors and derivatives by the vertices of the rim of one view."""
+        pose, columns = self._cameras.poses[view], 3 * len(part.vertices)
+        rim = _rim(part.vertices, normals, edges, pose[:, 3])
+        share = rim.share[:, None]
+        points = (1.0 - share) * part.vertices[rim.first] + share * part.vertices[rim.second]
+        seen = project(points, pose, self._cameras)
+        distance, slope = _sample(distances, seen.pixels)
+        size = np.array([self._cameras.width, self._cameras.height])
+        visible = (seen.depths > 0.0) & np.all((seen.pixels > 0) & (seen.pixels < size), axis=-1)
+        near = np.flatnonzero((np.abs(distance) < self._reach) & visible)
+        near = generator.permutation(near)[:_POINTS]
+        rows = _by_points(slope[near], seen.pixels[near], seen.depths[near], pose, self._cameras)
+        first, second = rim.first[near], rim.second[near]
+        blocks = np.concatenate([(1.0 - share[near]) * rows, share[near] * rows], axis=1)
+        at = 3 * np.stack([first, second], axis=1)[..., None] + np.arange(3)
+        row = np.repeat(np.arange(len(near)), 6)
+        entries = (blocks.ravel() / _DEVIATION, (row, at.ravel()))
+        matrix = scipy.sparse.coo_array(entries, shape=(len(near), columns)).tocsr()
+        return distance[near] / _DEVIATION, matrix
+
+
+def fit_profile(
+    outer: Revolution, outlines: Outlines, *, relief: Relief | None = None
+) -> Revolution:
+    """Fits a body of revolution to outlines alone.
+
+    Args:
+      outer: a body near the outlines, such as that of a mesh from masks.
+      outlines: the outlines.
+      relief: how the body may differ from one of revolution. It gets this relief only if the
+        outlines are explained better by it: meshes from masks have such a relief in hollows, too.
+    """
+    found = _fitted(outer.with_relief(None), outlines)
+    if relief is None:
+        return found
+    raised = _fitted(found.with_relief(relief), outlines)
+    better = _error(raised, outlines) < _BETTER * _error(found, outlines)
+    return raised if better else found
+
+
+def _fitted(outer: Revolution, outlines: Outlines) -> Revolution:
+    x = outer.start()
+    for _ in range(_ROUNDS):
+        rows = outlines.of_surface(outer.pose(x))
+        weighted = rows.weights[:, None] * rows.derivatives
+        precision, gradient = outer.prior(x, bend=_BEND)
+        matrix = weighted.T @ rows.derivatives + precision
+        x = x - np.linalg.solve(matrix, weighted.T @ rows.errors + gradient)
+    return outer.moved(x)
+
+
+def _error(outer: Revolution, outlines: Outlines) -> float:
+    """Returns the mean distance from the outlines, in standard deviations, up to the largest."""
+    errors = outlines.of_surface(outer.pose(outer.start())).errors
+    return float(np.mean(np.minimum(np.abs(errors), _WRONG / _DEVIATION)))
+
+
+class PlacedObject:
+    """An object of known shape whose direction, place and size are unknown, for `gauss_newton`.
+
+    The unknowns are a rotation vector about the middle of the object, in radians; a shift in world
+    units; and the logarithm of its size. Indices, tints and absorptions are known.
+
+    Attributes:
+      meshes: surface of each part as it is given, the order of `interfaces`.
+      interfaces: interfaces of the parts.
+      centre: middle of the box around all parts, world units.
+    """
+
+    def __init__(self, meshes: Sequence[Mesh], interfaces: Interfaces) -> None:
+        """Takes the parts.
+
+        Raises:
+          ReconstructionError: if there are none.
+        """
+        if not meshes:
+            raise ReconstructionError("The object has no parts. Pass at least one closed mesh.")
+        self.meshes, self.interfaces = tuple(meshes), interfaces
+        vertices = np.concatenate([mesh.vertices for mesh in meshes])
+        self.centre = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
+        self._size = diameter(vertices)
+
+    def start(self) -> Float[np.ndarray, "7"]:
+        """Returns zeros: the object as it is given."""
+        return np.zeros(7)
+
+    def pose(self, x: Float[np.ndarray, "7"]) -> Candidate:
+        """Returns the placed object."""
+        nothing = scipy.sparse.csr_array((len(self.meshes), 7))
+        posed = [self._placed(mesh, x) for mesh in self.meshes]
+        return Candidate(posed, self.interfaces, nothing, nothing[:0])
+
+    def index_of(self, x: Float[np.ndarray, "7"]) -> float:
+        """Returns the index of the first part, which is known."""
+        del x
+        return float(self.interfaces.index_inside[0])
+
+    def placed(self, x: Float[np.ndarray, "7"]) -> tuple[Mesh, ...]:
+        """Returns the surfaces of the placed parts."""
+        posed = [self._placed(mesh, x) for mesh in self.meshes]
+        return tuple(Mesh(p.vertices, p.faces, p.normals[p.normal_ids]) for p in posed)
+
+    def prior(
+        self, x: Float[np.ndarray, "7"]
+    ) -> tuple[Float[np.ndarray, "7 7"], Float[np.ndarray, "7"]]:
+        """Returns a wide prior around the object as it is given.
+
+        It keeps what neither outlines nor light determine, such as the rotation of a ball.
+        """
+        deviations = np.repeat([_TURN, _SHIFT * self._size, _GROWTH], [3, 3, 1])
+        return np.diag(deviations**-2.0), x / deviations**2
+
+    def scales(self) -> Float[np.ndarray, "7"]:
+        """Returns 0.02 radians, 0.77 % of the diameter, and 1 % of the size."""
+        return np.repeat([LARGEST_TURN, LARGEST_STEP * self._size, 0.01], [3, 3, 1])
+
+    def _placed(self, mesh: Mesh, x: Float[np.ndarray, "7"]) -> Posed:
+        turn, tangent = rotation(x[:3])
+        arms = math.exp(x[6]) * (mesh.vertices - self.centre) @ turn.T
+        normals, ids = np.unique(mesh.normals.reshape(-1, 3), axis=0, return_inverse=True)
+        normals = normals @ turn.T
+        moves = np.broadcast_to(np.eye(3), (len(arms), 3, 3))
+        still = np.zeros((len(normals), 3, 4))
+        by_vertices = np.concatenate([-_crosses(arms) @ tangent, moves, arms[..., None]], axis=-1)
+        by_normals = np.concatenate([-_crosses(normals) @ tangent, still], axis=-1)
+        return Posed(
+            self.centre + x[3:6] + arms,
+            mesh.faces,
+            normals,
+            ids.reshape(-1, 3),
+            by_vertices.reshape(-1, 7),
+            by_normals.reshape(-1, 7),
+        )
+
+
+def rotation(
+    vector: Float[np.ndarray, "3"],
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"]]:
+    """Returns the rotation of a rotation vector, and its left Jacobian.
+
+    A change `dv` of the vector turns the rotated object by the further rotation vector `J dv`.
+
+    Source: Rodrigues' formula; Sola, Deray and Atchuthan, A micro Lie theory (2018), Eq 145.
+    """
+    angle = float(np.linalg.norm(vector))
+    cross = _crosses(vector)
+    if angle < 1e-6:
+        return np.eye(3) + cross, np.eye(3) + 0.5 * cross
+    sine, cosine = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2
+    turn = np.eye(3) + sine * cross + cosine * cross @ cross
+    return turn, np.eye(3) + cosine * cross + (1.0 - sine) / angle**2 * cross @ cross
+
+
+def _crosses(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
+    """Returns the matrices of the cross products with vectors."""
+    return np.swapaxes(np.cross(vectors[..., None, :], np.eye(3)), -1, -2)
+
+
+def fit_placement(
+    model: PlacedObject,
+    outlines: Outlines,
+    *,
+    outermost: Sequence[int] = (0,),
+    x: Float[np.ndarray, "7"] | None = None,
+) -> Float[np.ndarray, "7"]:
+    """Fits direction, place and size of an object to outlines alone.
+
+    What outlines do not determine, such as the direction of a ball, stays.
+
+    Args:
+      model: the object.
+      outlines: the outlines; those with a long reach first, if the object is far away.
+      outermost: numbers of the parts that no other part contains.
+      x: placement to begin with; the object as it is given by default.
+    """
+    x = model.start() if x is None else x
+    for _ in range(_PLACEMENT_ROUNDS):
+        parts = model.pose(x).parts
+        rows = outlines.of_surfaces([parts[number] for number in outermost])
+        weighted = rows.weights[:, None] * rows.derivatives
+        precision, gradient = model.prior(x)
+        matrix = weighted.T @ rows.derivatives + precision
+        change = -np.linalg.solve(matrix, weighted.T @ rows.errors + gradient)
+        x = x + change
+        if np.max(np.abs(change) / model.scales()) < _PLACED:
+            break
+    return x
+
+
+def _vertex_normals(part: Posed) -> Float[np.ndarray, "vertices 3"]:
+    """Returns the mean of the corner normals at each vertex."""
+    at, each = part.faces.ravel(), part.normals[part.normal_ids.ravel()]
+    sums = [np.bincount(at, each[:, axis], len(part.vertices)) for axis in range(3)]
+    return unit_vectors(np.stack(sums, axis=-1))
+
+
+def _edges(faces: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, "edges 2"]:
+    """Returns each edge of a closed mesh once."""
+    both = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    return both[both[:, 0] < both[:, 1]]
+
+
+def _rim(
+    vertices: Float[np.ndarray, "vertices 3"],
+    normals: Float[np.ndarray, "vertices 3"],
+    edges: Int[np.ndarray, "edges 2"],
+    camera: Float[np.ndarray, "3"],
+) -> _Rim:
+    """Returns where the interpolated normals are perpendicular to the lines of sight."""
+    facing = np.sum(normals * (camera - vertices), axis=-1)
+    first, second = facing[edges[:, 0]], facing[edges[:, 1]]
+    turns = np.flatnonzero((first > 0.0) != (second > 0.0))
+    share = first[turns] / (first[turns] - second[turns])
+    return _Rim(edges[turns, 0], edges[turns, 1], share)
+
+
+def _sample(
+    image: Float[np.ndarray, "h w"], pixels: Float[np.ndarray, "points 2"]
+) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, "points 2"]]:
+    """Returns an image, whose values are at the centres of pixels, and its slope at points."""
+    height, width = image.shape
+    place = np.clip(pixels - 0.5, 0.0, [width - 1.001, height - 1.001])
+    column, row = place.astype(np.int64).T
+    right, down = (place - np.stack([column, row], axis=-1)).T
+    a, b = image[row, column], image[row, column + 1]
+    c, d = image[row + 1, column], image[row + 1, column + 1]
+    value = (1.0 - down) * ((1.0 - right) * a + right * b) + down * ((1.0 - right) * c + right * d)
+    along = (1.0 - down) * (b - a) + down * (d - c)
+    across = (1.0 - right) * (c - a) + right * (d - b)
+    return value, np.stack([along, across], axis=-1)
+
+
+def _by_points(
+    slope: Float[np.ndarray, "points 2"],
+    pixels: Float[np.ndarray, "points 2"],
+    depths: Float[np.ndarray, " points"],
+    pose: Float[np.ndarray, "3 4"],
+    cameras: Cameras,
+) -> Float[np.ndarray, "points 3"]:
+    """Returns the derivatives of the signed distance by a point in world units."""
+    middle = 0.5 * np.array([cameras.width, cameras.height])
+    x, y = (pixels - middle).T / cameras.focal
+    right, up, back = pose[:, 0], pose[:, 1], pose[:, 2]
+    scale = cameras.focal / depths
+    # A pixel is middle + focal (x, -y) / depth, and depth is along minus the third axis.
+    by_column = scale[:, None] * (right + x[:, None] * back)
+    by_row = scale[:, None] * (-up + y[:, None] * back)
+    return slope[:, :1] * by_column + slope[:, 1:] * by_row

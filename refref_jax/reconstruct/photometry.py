@@ -35,9 +35,8 @@ from refref_jax.geometry.surfaces import Surfaces
 from refref_jax.optics import light_paths, path_tracing
 from refref_jax.optics.differentiable_paths import find_primitives, follow_branch
 from refref_jax.optics.light_paths import PathStatus
-from refref_jax.optics.media import AMBIENT, INDEX_OF_AIR, Interfaces
+from refref_jax.optics.media import AMBIENT, INDEX_OF_AIR, Interfaces, Scene, meshes_of
 from refref_jax.optics.path_settings import TREE, PathSettings
-from refref_jax.optics.scene import Scene
 from refref_jax.render import backdrop, images, pixels
 from refref_jax.render.backdrop import Lookups, Mips
 from refref_jax.sampling.scene_bounds import Domain
@@ -323,9 +322,9 @@ def _differentiate(
     ahead = jnp.zeros(MAIN.max_bends, bool)
     primitives = jax.vmap(lambda ray: find_primitives(scene, ray, ahead, settings=MAIN))(rays)
     replay = functools.partial(_replay, scene, domain)
-    triangles = scene.surfaces.bvh.triangles[primitives]
-    normals = scene.surfaces.normals[primitives]
-    parts = scene.surfaces.parts[primitives]
+    meshes = meshes_of(scene)
+    triangles = meshes.bvh.triangles[primitives]
+    normals, parts = meshes.normals[primitives], meshes.parts[primitives]
     indices = scene.interfaces.index_inside
     absorptions = scene.interfaces.absorption
     by = jax.jacrev(replay, argnums=(0, 1, 2, 3), has_aux=True)
@@ -372,8 +371,9 @@ def _replay(
     ray: Rays,
 ) -> tuple[Float[Array, "3"], light_paths.PathEnds]:
     """Returns the coordinates of the main path of one ray, through the triangles given."""
-    bvh = scene.surfaces.bvh._replace(triangles=corners)
-    surfaces = scene.surfaces._replace(bvh=bvh, normals=normals, parts=parts)
+    meshes = meshes_of(scene)
+    bvh = meshes.bvh._replace(triangles=corners)
+    surfaces = meshes._replace(bvh=bvh, normals=normals, parts=parts)
     interfaces = with_indices(scene.interfaces, indices)._replace(absorption=absorptions)
     local = Scene(surfaces, interfaces)
     casts = jnp.arange(primitives.shape[0], dtype=jnp.int32)

@@ -34,8 +34,8 @@ from jaxtyping import Array, Float, Int
 
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics.differentiable_paths import follow_main_branches
+from refref_jax.optics.media import Scene, with_index
 from refref_jax.optics.path_settings import PathSettings
-from refref_jax.optics.scene import Scene, with_index
 from refref_jax.reconstruct import ReconstructionError
 from refref_jax.render import pixels
 from refref_jax.render.model import ModelConfig, Params

@@ -27,8 +27,8 @@ from refref_jax.geometry.cameras import Cameras
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import light_paths, path_tracing
 from refref_jax.optics.light_paths import LightPaths, PathEnds
+from refref_jax.optics.media import Scene
 from refref_jax.optics.path_settings import PathSettings
-from refref_jax.optics.scene import Scene
 from refref_jax.render import images, pixels
 from refref_jax.render.backgrounds import Radiance
 

@@ -22,10 +22,16 @@ from refref_jax import configuration
 from refref_jax.fields import registry
 from refref_jax.geometry.bvh import BVH
 from refref_jax.geometry.surfaces import Surfaces
-from refref_jax.optics.media import Interfaces
+from refref_jax.optics.media import Interfaces, Scene, meshes_of
 from refref_jax.optics.path_settings import PathSettings
-from refref_jax.optics.scene import Scene
-from refref_jax.render.model import Model, ModelConfig, Params, init_params
+from refref_jax.render.model import (
+    Model,
+    ModelConfig,
+    Params,
+    bends_light,
+    init_params,
+    surface_scene,
+)
 
 _MODEL = "model.json"
 _GEOMETRY = "geometry.npz"
@@ -52,7 +58,7 @@ class SavedModel:
 def save_scene(run: Path, saved: SavedModel, scene: Scene) -> None:
     """Writes a model without its parameters to an existing folder."""
     write_static(run, saved)
-    surfaces, interfaces = scene
+    surfaces, interfaces = meshes_of(scene), scene.interfaces
     np.savez_compressed(
         run / _GEOMETRY,
         **surfaces.bvh._asdict(),
@@ -92,7 +98,10 @@ def load_model(run: str | os.PathLike[str], *, step: int | None = None) -> Model
     # Restored arrays are committed to a device, and so are all results computed from them. The
     # initial sums of an image are not, so their chunk would be compiled separately.
     unbound = jax.tree.map(jnp.asarray, jax.device_get(params))
-    return Model(saved.config, saved.settings, load_scene(run), Params(*unbound))
+    learned = Params(*unbound)
+    if bends_light(saved.config):
+        return Model(saved.config, saved.settings, surface_scene(learned, saved.config), learned)
+    return Model(saved.config, saved.settings, load_scene(run), learned)
 
 
 def latest_step(run: Path) -> int:

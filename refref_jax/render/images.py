@@ -21,19 +21,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from refref_jax import numerics
 from refref_jax.choices import side_of
 from refref_jax.compilation import runs_on_cpu
 from refref_jax.geometry import bvh
 from refref_jax.geometry.cameras import Cameras, box_filter, pixel_rays, supersample
 from refref_jax.geometry.rays import Rays
-from refref_jax.geometry.surfaces import Surfaces, surface_point
+from refref_jax.geometry.surfaces import LevelSet, Surfaces, closest, meet, surface_point
 from refref_jax.numerics import host_array
 from refref_jax.optics import light_paths, path_tracing
 from refref_jax.optics.light_paths import Branch, LightPaths, reflected_first
-from refref_jax.optics.media import EMPTY_SLOT
+from refref_jax.optics.media import EMPTY_SLOT, Scene
 from refref_jax.optics.path_settings import Detail, PathSettings
 from refref_jax.optics.path_tracing import Traced
-from refref_jax.optics.scene import Scene
 from refref_jax.render import learned_media, pixels
 from refref_jax.render.model import Model, ModelConfig, Params, path_detail
 from refref_jax.render.model import Rendering as Rendering
@@ -445,7 +445,9 @@ class FirstSurface(NamedTuple):
     parts: Int[np.ndarray, "*rays"]
 
 
-def find_first_surface(surfaces: Surfaces, rays: Rays, *, tile: int = CAST_TILE) -> FirstSurface:
+def find_first_surface(
+    surfaces: Surfaces | LevelSet, rays: Rays, *, tile: int = CAST_TILE
+) -> FirstSurface:
     """Casts rays and returns the first surface of each.
 
     Args:
@@ -471,14 +473,28 @@ def find_first_surface(surfaces: Surfaces, rays: Rays, *, tile: int = CAST_TILE)
 
 @jax.jit
 def _cast_tile(
-    surfaces: Surfaces, rays: Rays
+    surfaces: Surfaces | LevelSet, rays: Rays
 ) -> tuple[Float[Array, " rays"], Float[Array, "rays 3"], Int[Array, " rays"]]:
+    if isinstance(surfaces, LevelSet):
+        return jax.vmap(_meet_level_set, in_axes=(None, 0))(surfaces, rays)
     limits = jnp.full_like(rays.radii, jnp.inf)
     exclude_primitive = jnp.full(rays.radii.shape, bvh.NO_PRIMITIVE, jnp.int32)
     hits = bvh.closest_hits(surfaces.bvh, rays, limits=limits, exclude_primitive=exclude_primitive)
     found = hits.primitive_ids != bvh.NO_PRIMITIVE
-    points = jax.vmap(surface_point, in_axes=(None, 0, 0))(
-        surfaces, hits.primitive_ids, hits.barycentrics
-    )
+    point = functools.partial(surface_point, surfaces)
+    points = jax.vmap(point)(hits.primitive_ids, hits.barycentrics)
     normals = jnp.where(found[:, None], points.shading_normal, 0.0)
     return hits.distances, normals, jnp.where(found, points.part, NO_PART)
+
+
+def _meet_level_set(
+    surface: LevelSet, ray: Rays
+) -> tuple[Float[Array, ""], Float[Array, "3"], Int[Array, ""]]:
+    """Returns distance, normal and part of the first hit of one ray."""
+    limit, nothing = jnp.full_like(ray.radii, jnp.inf), jnp.int32(bvh.NO_PRIMITIVE)
+    stretch = closest(surface, ray.origins, ray.directions, limit, nothing)
+    point = meet(surface, stretch, ray.origins, ray.directions)
+    found = stretch != bvh.NO_PRIMITIVE
+    distance = jnp.where(found, numerics.length(point.position - ray.origins), jnp.inf)
+    normal = jnp.where(found, point.shading_normal, 0.0)
+    return distance, normal, jnp.where(found, point.part, NO_PART)

@@ -26,11 +26,13 @@ from refref_jax.choices import (
     SplatFilter,
     ViewDependence,
 )
-from refref_jax.fields import base, registry
+from refref_jax.fields import base, registry, tnsr
 from refref_jax.fields.base import DensityConfig, Radiance, RadianceConfig, Surface
 from refref_jax.fields.neus import SurfaceConfig
+from refref_jax.fields.tnsr import TnsrConfig
+from refref_jax.optics import interface_rules
+from refref_jax.optics.media import Scene, with_index
 from refref_jax.optics.path_settings import Detail, PathSettings, Tally
-from refref_jax.optics.scene import Scene
 from refref_jax.render import backdrop, learned_media
 from refref_jax.render.backdrop import Pyramid
 from refref_jax.render.learned_media import LearnedTints
@@ -412,7 +414,7 @@ def look_up_surface(
     ball = ball_of(config)
     offset = point - jnp.asarray(ball.centre, point.dtype)
     cell = scene_bounds.to_unit_cube(config.domain, Gaussians(point[None], jnp.zeros(1)))
-    seen = registry.radiance(params.field, config.field, cell, direction)
+    seen = registry.radiance(params.field, tnsr.opaque(config.field), cell, direction)
     assert isinstance(seen, Surface)
     distance = jnp.maximum(ball.radius * seen.signed, numerics.length(offset) - ball.radius)
     return SurfaceValue(distance, numerics.normalize(seen.slope), seen.rgb)
@@ -436,3 +438,28 @@ def ball_of(config: ModelConfig) -> Ball:
     edge, middle = 2.0 * config.radius, zip(config.centre, config.field.ball_centre, strict=True)
     x, y, z = (centre + edge * (share - 0.5) for centre, share in middle)
     return Ball((x, y, z), edge * config.field.ball_radius)
+
+
+def bends_light(config: ModelConfig) -> bool:
+    """Returns whether a model has its own surface, which bends light."""
+    return isinstance(config.field, TnsrConfig)
+
+
+def opaque_model(config: ModelConfig) -> ModelConfig:
+    """Returns the model of the first part of the training, whose surface stops straight rays."""
+    assert isinstance(config.field, SurfaceConfig)
+    return dataclasses.replace(config, field=tnsr.opaque(config.field), interior="field")
+
+
+def surface_scene(params: Params, config: ModelConfig) -> Scene:
+    """Returns the scene whose surface a model has learned, and bends light; differentiable.
+
+    Args:
+      params: parameters of the model.
+      config: configuration of the model, for which `bends_light` holds.
+    """
+    assert isinstance(config.field, TnsrConfig)
+    ball = ball_of(config)
+    surface = tnsr.level_set(params.field, config.field, centre=ball.centre, radius=ball.radius)
+    glass = interface_rules.nested([config.field.index], [interface_rules.NO_PARENT])
+    return with_index(Scene(surface, glass), tnsr.index_of(params.field, config.field))

@@ -25,8 +25,8 @@ from refref_jax.geometry.rays import Rays
 from refref_jax.numerics import host_array
 from refref_jax.optics import path_tracing
 from refref_jax.optics.light_paths import LightPaths, PathStatus
+from refref_jax.optics.media import Scene
 from refref_jax.optics.path_settings import Detail, PathSettings, Tally
-from refref_jax.optics.scene import Scene
 from refref_jax.render import Model, learned_media
 from refref_jax.render.learned_media import LearnedTints
 from refref_jax.sampling import scene_bounds

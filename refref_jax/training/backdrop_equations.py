@@ -25,8 +25,8 @@ from refref_jax.geometry.cameras import Cameras
 from refref_jax.geometry.rays import Rays
 from refref_jax.numerics import host_array
 from refref_jax.optics import light_paths, path_tracing
+from refref_jax.optics.media import Scene
 from refref_jax.optics.path_settings import STRAIGHT, Detail, PathSettings, Tally
-from refref_jax.optics.scene import Scene
 from refref_jax.render import backdrop, images, learned_media, pixels
 from refref_jax.render.backdrop import Lookups, Mips, Pyramid
 from refref_jax.render.learned_media import LearnedTints

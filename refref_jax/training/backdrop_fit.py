@@ -18,7 +18,7 @@ from jaxtyping import Bool, UInt8
 from refref_jax import configuration
 from refref_jax.data import image_files, scene_folder
 from refref_jax.data.scene_folder import Frames
-from refref_jax.optics.scene import Scene
+from refref_jax.optics.media import Scene
 from refref_jax.render import backdrop, pixels
 from refref_jax.render.backdrop import Pyramid
 from refref_jax.render.checkpoint_io import SavedModel

@@ -13,16 +13,18 @@ neither JAX nor the library's numerics.
 import dataclasses
 import math
 from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 from refref_jax import choices, configuration
 from refref_jax.configuration import Option, option
+from refref_jax.configuration import require as require
 from refref_jax.optics.path_settings import Reentry, check_max_bends, check_min_throughput
-
-_Value = TypeVar("_Value")
 
 # Options that determine the objects, and the shape of the fields.
 _OBJECTS, _KIND = ("scene", "properties", "reconstruction"), ("preset", "field")
+
+SURFACE_ONLY = ("surface_start", "straight_share", "surface_index", "surface_index_from")
+"""Options that only a surface that bends light reads."""
 
 FIELD_ONLY = (
     *("preset", "field", "footprint", "samples_per_ray", "multisamples", "dilation"),
@@ -30,7 +32,7 @@ FIELD_ONLY = (
     *("data_loss", "interlevel_weight", "blurs", "distortion_weight", "hash_decay", "distortion"),
     *("path_losses", "steps", "warmup", "learning_rate", "final_learning_rate", "anneal", "batch"),
     *("pretraced_batches", "adam_b2", "sub_spaces", "eikonal_weight", "curvature_weight"),
-    *("gaussians", "splat_filter"),
+    *("gaussians", "splat_filter", *SURFACE_ONLY),
 )
 """Options that only a radiance field reads."""
 
@@ -153,10 +155,17 @@ class FieldConfig:
     Attributes:
       preset: Size of the model and length of its training.
       field: Field kind: zipnerf; nerfacto, without anti-aliasing; msnerf, with sub-spaces; neus or
-        unisurf, with the surface of an opaque object; or, in place of a field, Gaussian splats.
+        unisurf, with the surface of an opaque object; tnsr, whose learned surface bends light; or,
+        in place of a field, Gaussian splats.
       sub_spaces: Number of sub-spaces, only of field=msnerf.
       gaussians: Number of Gaussians, only of field=splats.
       splat_filter: Opacity of blurred Gaussians: reduced (mip) or kept (classic), of field=splats.
+      surface_start: Initial surface of field=tnsr: a ball, or that of the scene's meshes.
+      straight_share: Share of the steps in which rays are straight and the surface of field=tnsr
+        opaque, in [0, 1); by default 0.5 from a ball, 0 from meshes.
+      surface_index: Index of refraction of field=tnsr, relative to the medium around it; by default
+        that of the scene's largest mesh, else 1.5.
+      surface_index_from: Source of this index: given, or learned from there.
       interior: Model of the inside of the objects: a learned field (the paper), empty (clear), or
         interfaces and media that absorb light (absorbing). By default clear if all objects are
         clear in scene.json, else absorbing.
@@ -199,6 +208,10 @@ class FieldConfig:
     sub_spaces: int | None = option(None, after=_KIND)
     gaussians: int | None = option(None, after=_KIND)
     splat_filter: choices.SplatFilter | None = option(None, after=_KIND)
+    surface_start: choices.SurfaceStart | None = option(None, after=_KIND)
+    straight_share: float | None = option(None, after=(*_KIND, "surface_start"))
+    surface_index: float | None = option(None, after=(*_OBJECTS, *_KIND))
+    surface_index_from: choices.IndexFrom | None = option(None, after=_KIND)
     interior: choices.Interior | None = option(
         None, after=(*_OBJECTS, "paths", "max_bends", "tints")
     )
@@ -454,20 +467,6 @@ class TrainConfig:
         if section:
             new = {section: dataclasses.replace(getattr(self, section), **new)}
         return dataclasses.replace(self, **new)
-
-
-def require(value: _Value | None) -> _Value:
-    """Returns the value of an option that `training.resolve` has decided.
-
-    Raises:
-      ValueError: if it is `None`, which leaves the decision open.
-    """
-    if value is None:
-        raise ValueError(
-            "An option that training needs is None, which leaves it open. Use the configuration "
-            "that training.resolve returns."
-        )
-    return value
 
 
 def type_of(option: Option) -> Any:

@@ -24,11 +24,18 @@ from refref_jax import atomic_files, compilation, configuration
 from refref_jax.data import image_files, scene_analysis, scene_folder, scene_source
 from refref_jax.data.batches import PixelSampler
 from refref_jax.data.meshes import MeshPart
-from refref_jax.optics.scene import Scene
+from refref_jax.optics.media import Scene
 from refref_jax.render import checkpoint_io
 from refref_jax.render.checkpoint_io import SavedModel
 from refref_jax.render.model import Model, ModelConfig, Params, has_foreground
-from refref_jax.training import backdrop_equations, backdrop_fit, devices, loop, run_folder
+from refref_jax.training import (
+    backdrop_equations,
+    backdrop_fit,
+    devices,
+    learned_surface,
+    loop,
+    run_folder,
+)
 from refref_jax.training.config import TrainConfig, require
 from refref_jax.training.loop import TrainState, init_state
 from refref_jax.training.resolve import Resolved, build_scene, read_facts, resolve
@@ -310,6 +317,9 @@ def _train_field(
     state = devices.put_everywhere(state, mesh=mesh)
     if checkpoints.newest() is not None:
         state = checkpoints.restore(state)
+    elif config.model.surface_start == "meshes":
+        params = learned_surface.fit(state.params, model.config, objects, seed=config.seed)
+        state = devices.put_everywhere(state._replace(params=params), mesh=mesh)
     elif surface:
         state = backdrop_fit.behind_field(
             run, state, config, model, objects, folder, log.progress, log.stop

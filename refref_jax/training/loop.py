@@ -21,19 +21,25 @@ from refref_jax.data.batches import PixelSampler
 from refref_jax.fields import registry
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import light_paths, path_tracing
-from refref_jax.optics.path_settings import Detail, PathSettings, capacity_for
+from refref_jax.optics.media import Scene
+from refref_jax.optics.path_settings import (
+    STRAIGHT,
+    Detail,
+    PathSettings,
+    capacity_for,
+)
 from refref_jax.optics.path_tracing import Survey, Traced
-from refref_jax.optics.scene import Scene
 from refref_jax.render import pixels
 from refref_jax.render.model import (
     ModelConfig,
     Params,
+    bends_light,
     has_foreground,
     init_params,
     path_detail,
     surface_of,
 )
-from refref_jax.training import devices, objective
+from refref_jax.training import devices, learned_surface, objective
 from refref_jax.training.config import ScheduleConfig, TrainConfig, require
 from refref_jax.training.devices import AXIS
 from refref_jax.training.objective import StepReport, Totals
@@ -78,12 +84,24 @@ def init_state(seed: int, model: ModelConfig, schedule: ScheduleConfig) -> Train
 def optimizer(schedule: ScheduleConfig, model: ModelConfig) -> optax.GradientTransformation:
     """Returns Adam with the schedule's learning rate and second moment decay.
 
-    A backdrop behind a field stays as it is.
+    A backdrop behind a field stays as it is, and a surface that bends light learns slowly.
     """
-    adam = optax.adam(learning_rate(schedule), b2=schedule.adam_b2, eps=_EPSILON)
+    rate = learning_rate(schedule)
+    adam = optax.adam(rate, b2=schedule.adam_b2, eps=_EPSILON)
+    if bends_light(model):
+        slow = learned_surface.slowed(rate, model, require(schedule.steps))
+        surface = optax.adam(slow, b2=schedule.adam_b2, eps=_EPSILON)
+        return optax.partition({"learned": adam, "surface": surface}, _surface_labels)
     if not has_foreground(model):
         return adam
     return optax.partition({"learned": adam, "fixed": optax.set_to_zero()}, _labels)
+
+
+def _surface_labels(params: Params) -> Params:
+    """Returns which parameters are those of a surface that bends light."""
+    learned = jax.tree.map(lambda leaf: "learned", params)
+    surface = jax.tree.map(lambda leaf: "surface", params.field.surface)
+    return learned._replace(field=learned.field._replace(surface=surface))
 
 
 def _labels(params: Params) -> Params:
@@ -237,20 +255,22 @@ def _step(
     batch = pretraced.order[place]
     traced, rgb = jax.tree.map(lambda x: x[batch], (pretraced.traced, pretraced.rgb))
     key = jax.random.fold_in(jax.random.key(config.seed), state.step)
-    jitter = pixels.random_jitter(key, model, _slots(traced.paths.radii.shape[0], axis))
+    branches = (
+        path_tracing.branches_of(learned_surface.settings_of(config)) if bends_light(model) else 1
+    )
+    jitter = pixels.random_jitter(key, model, _slots(branches * traced.paths.radii.shape[0], axis))
     anneal = _anneal(state.step, require(config.schedule.anneal))
     progress = _progress(state.step, config, model)
 
+    gather = functools.partial(
+        pixels.gather_light, rays=rgb.shape[0], anneal=anneal, progress=progress
+    )
+
     def sum_paths(params: Params) -> Totals:
-        light = pixels.gather_light(
-            params,
-            model,
-            traced.paths,
-            jitter,
-            rays=rgb.shape[0],
-            anneal=anneal,
-            progress=progress,
-        )
+        if bends_light(model):
+            through = key, params, model, traced.paths, jitter
+            return learned_surface.total(*through, gather=gather, progress=progress, config=config)
+        light = gather(params, model, traced.paths, jitter)
         return objective.total(light, traced.paths, config.losses)
 
     def combine(params: Params, totals: Totals) -> tuple[Float[Array, ""], StepReport]:
@@ -337,6 +357,8 @@ def set_up(
     half a gibibyte; while they are concatenated, three times that is in use.
     """
     scene = jax.tree.map(jnp.asarray, scene)
+    if bends_light(model):  # paths through the surface are traced within the steps
+        settings = STRAIGHT
     found = survey_paths(scene, sampler.survey(_SURVEY).rays, settings=settings)
     found = devices.as_in_the_first(jax.device_get(found))
     batch = require(config.schedule.batch)

@@ -109,7 +109,8 @@ class StepReport(NamedTuple):
       dropped: mean dropped throughput of the batch's rays.
       eikonal: unweighted eikonal loss, if the field has a surface.
       curvature: unweighted curvature loss.
-      surface_share: share of the light that comes from inside the ball of the surface.
+      surface_share: share of the light that comes from inside the ball of the surface, or, if it
+        bends light, of the paths that meet it.
     """
 
     loss: Float[Array, ""]

@@ -41,15 +41,13 @@ of one image each.
 import dataclasses
 from typing import Any
 
-import numpy as np
-
 from refref_jax.choices import InFront, Interior, Paths
-from refref_jax.fields import hash_grid, msnerf, neus, registry
+from refref_jax.fields import hash_grid, msnerf, registry
 from refref_jax.fields.base import RadianceConfig
 from refref_jax.fields.hash_grid import HashGridConfig
-from refref_jax.geometry.cameras import Cameras
 from refref_jax.render.model import BackdropConfig, ModelConfig, ProposalConfig, SplatsConfig
 from refref_jax.sampling.scene_bounds import Bounds
+from refref_jax.training import learned_surface
 from refref_jax.training.config import (
     BACKDROP_ONLY,
     FIELD_ONLY,
@@ -75,13 +73,6 @@ _NOT_READ = (
     *("rule", "ior", "shading", "pixels", "min_throughput", "max_bends", "reentry"),
     *("interior", "tints", "tint_decay"),
 )
-
-# Radius of the ball of a surface, in distances of the nearest camera: 2.2 world units in the data
-# set, whose objects end at 2.1. In a larger ball, each camera could see a part of it by itself.
-_BALL = 0.55
-
-# Mean squared sine of the angles to a common axis below which optical axes are parallel.
-_PARALLEL = 1e-3
 
 # Blur of the interlevel loss for each proposal level (Zip-NeRF, supplement).
 _BLURS = (0.03, 0.003)
@@ -146,48 +137,6 @@ class Preset:
         return registry.KINDS[model.field.kind].sizes[self.size].background_samples
 
 
-def place_surface(model: ModelConfig, cameras: Cameras) -> ModelConfig:
-    """Returns a model whose surface, if its field has one, lies in a ball between the cameras.
-
-    The ball is around the point that the cameras look at, and ends before the nearest of them; an
-    object behind a camera has no surface.
-
-    Args:
-      model: model of a preset.
-      cameras: cameras of the training images.
-
-    Raises:
-      ValueError: if space is contracted, or the cameras do not look at one place.
-    """
-    field = model.field
-    if not isinstance(field, neus.SurfaceConfig):
-        return model
-    if model.space == "unbounded":
-        raise ValueError(
-            f"field={field.kind} has a surface in a ball of the world, but the space of this scene "
-            "is contracted (background=unbounded or contraction=always). Use field=zipnerf, or "
-            "state the cube or sphere around the scene."
-        )
-    positions, axes = cameras.poses[:, :, 3], -cameras.poses[:, :, 2]
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    spread, towards = across.mean(0), np.einsum("nij,nj->i", across, positions) / len(axes)
-    focus = np.linalg.lstsq(spread, towards)[0]
-    depths = np.sum((focus - positions) * axes, axis=-1)
-    nearest = float(np.min(np.linalg.norm(positions - focus, axis=-1)))
-    beyond = float(np.max(np.abs(focus - model.centre)))
-    radius = min(_BALL * nearest, model.radius - beyond)
-    parallel = np.linalg.eigvalsh(spread)[0] < _PARALLEL
-    if parallel or radius <= 0.0 or not np.all(depths > 0.0):
-        raise ValueError(
-            f"field={field.kind} needs cameras around an object, but these do not all look at one "
-            "place in the scene. Use field=zipnerf."
-        )
-    edge = 2.0 * model.radius
-    x, y, z = (float(place) for place in 0.5 + (focus - model.centre) / edge)
-    field = dataclasses.replace(field, ball_centre=(x, y, z), ball_radius=radius / edge)
-    return dataclasses.replace(model, field=field)
-
-
 def override_model(
     model: ModelConfig, asked: FieldConfig, *, in_front: InFront = "nothing"
 ) -> ModelConfig:
@@ -230,6 +179,7 @@ def override_model(
         field = dataclasses.replace(model.field, precision=asked.precision)
         model = dataclasses.replace(model, proposals=proposals, field=field)
     field = _with_sub_spaces(_with_grid(model.field, asked), asked.sub_spaces)
+    field = learned_surface.with_options(field, asked)
     if asked.colour_network != "plain":
         if not isinstance(field, hash_grid.GridRadianceConfig):
             raise ValueError(
@@ -287,10 +237,27 @@ def _with_sub_spaces(field: RadianceConfig, count: int | None) -> RadianceConfig
     return dataclasses.replace(field, sub_spaces=count)
 
 
+def check_straight(config: TrainConfig) -> None:
+    """Refuses overrides about objects for straight rays, which ignore objects.
+
+    Raises:
+      ValueError: if one would have no effect.
+    """
+    asked = {"interior": config.model.interior, "reentry": config.paths.reentry}
+    for name, value in asked.items():
+        if value not in (None, "field", "possible"):
+            raise ValueError(
+                f"{name}={value} has no effect: straight rays (paths={config.paths.name}) ignore "
+                "objects. Leave it out, or use paths=tree with meshes."
+            )
+
+
 def usual_paths(field: str, parts: int) -> tuple[Paths, str]:
     """Returns the light paths of a scene with some number of parts, and the reason for them."""
     if field == SPLATS:
         return "straight", "Gaussian splats have no light paths"
+    if field == learned_surface.KIND:
+        return "paper", "field=tnsr, whose surface bends light"
     return ("tree", "there are meshes") if parts else ("straight", "there are no meshes")
 
 

@@ -37,13 +37,12 @@ from refref_jax.data.scene_analysis import SceneAnalysis
 from refref_jax.data.scene_assembly import assemble_scene
 from refref_jax.data.scene_properties import SceneProperties
 from refref_jax.geometry.cameras import Cameras
-from refref_jax.optics.media import INDEX_OF_AIR
+from refref_jax.optics.media import INDEX_OF_AIR, Scene
 from refref_jax.optics.path_settings import PathSettings, make_path_settings
-from refref_jax.optics.scene import Scene
 from refref_jax.render.checkpoint_io import SavedModel
 from refref_jax.render.model import ModelConfig, has_foreground
 from refref_jax.sampling import scene_bounds
-from refref_jax.training import presets
+from refref_jax.training import learned_surface, presets
 from refref_jax.training.config import (
     BACKDROP_ONLY,
     BACKDROP_PIXELS,
@@ -228,43 +227,31 @@ def _decide(
 def _resolve_paths(
     config: TrainConfig, found: SceneAnalysis, reasons: dict[str, str]
 ) -> tuple[PathSettings, TrainConfig]:
-    if found.parts == 0 and config.paths.name not in (None, "straight"):
+    bends = config.model.field == learned_surface.KIND
+    if found.parts == 0 and not bends and config.paths.name not in (None, "straight"):
         raise ValueError(
             f"There are no meshes that could bend light for paths={config.paths.name}."
             " Add .ply files of the objects to the scene's folder meshes, or use paths=straight."
         )
     name, why = presets.usual_paths(config.model.field, found.parts)
     config = _decide(config, reasons, why, paths=name)
+    if bends:
+        config = _decide(config, reasons, why, max_bends=learned_surface.BENDS)
     paths = config.paths
     settings = make_path_settings(
         require(paths.name), min_throughput=paths.min_throughput, max_bends=paths.max_bends
     )
     if settings.max_bends:
         why = "light may meet the objects again"
-        if found.reentry == "impossible":
+        if found.reentry == "impossible" and not bends:
             why = "light that has left one convex object meets none again"
-        config = _decide(config, reasons, why, reentry=found.reentry)
+        config = _decide(config, reasons, why, reentry="possible" if bends else found.reentry)
     else:
-        _check_straight(config)
+        presets.check_straight(config)
     why = f"paths={paths.name}"
     return settings, _decide(
         config, reasons, why, min_throughput=settings.min_throughput, max_bends=settings.max_bends
     )
-
-
-def _check_straight(config: TrainConfig) -> None:
-    """Refuses overrides about objects for straight rays, which ignore objects.
-
-    Raises:
-      ValueError: if one would have no effect.
-    """
-    asked = {"interior": config.model.interior, "reentry": config.paths.reentry}
-    for name, value in asked.items():
-        if value not in (None, "field", "possible"):
-            raise ValueError(
-                f"{name}={value} has no effect: straight rays (paths={config.paths.name}) ignore "
-                "objects. Leave it out, or use paths=tree with meshes."
-            )
 
 
 def _resolve_inside(
@@ -272,7 +259,10 @@ def _resolve_inside(
 ) -> TrainConfig:
     """Decides the model of the inside of the objects, and the source of their colours."""
     interior: choices.Interior | None
-    if settings.max_bends == 0:
+    if config.model.field == learned_surface.KIND:
+        learned_surface.check(config, found.parts)
+        interior, why = "clear", "field=tnsr, whose surface is that of a clear body"
+    elif settings.max_bends == 0:
         interior, why = "field", "straight rays ignore the objects"
     elif found.interior == "clear" and config.model.tints != "learned":
         interior, why = "clear", "the objects are clear in scene.json"
@@ -313,9 +303,13 @@ def _resolve_model(
     extent, config = _resolve_bounds(config, facts, reasons)
     preset = presets.PRESETS[config.model.preset]
     model = preset.model(extent, require(config.model.interior), field=config.model.field)
-    model = presets.place_surface(model, facts.cameras)
+    model = learned_surface.place(model, facts.cameras)
+    if config.model.field == learned_surface.KIND:
+        for why, values in learned_surface.usual(config.model, facts.parts, facts.ambient):
+            config = _decide(config, reasons, why, **values)
     learned = facts.analysis.parts if config.model.tints == "learned" else 0
-    fields = () if model.interior == "field" else facts.analysis.field_parts
+    inside = model.interior == "field" or config.model.field == learned_surface.KIND
+    fields = () if inside else facts.analysis.field_parts
     model = dataclasses.replace(model, learned_tints=learned, field_parts=fields)
     config = _resolve_far_field(config, facts, reasons)
     fewer = preset.background_samples(model) if config.model.far_field == "field" else None
@@ -371,7 +365,8 @@ def _needs_of_a_field(config: TrainConfig, facts: SceneFacts) -> list[str]:
         "Gaussian splats (field=splats)": config.model.field == presets.SPLATS,
         "straight rays (paths=straight)": facts.analysis.parts > 0 and not config.paths.max_bends,
         "contraction=always": config.model.contraction == "always",
-        "a surface (field=neus or unisurf)": config.model.field in ("neus", "unisurf"),
+        "a surface (field=neus, unisurf or tnsr)": config.model.field
+        in ("neus", "unisurf", "tnsr"),
     }
     return [name for name, holds in needs.items() if holds]
 

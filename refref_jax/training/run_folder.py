@@ -22,7 +22,7 @@ import orbax.checkpoint as ocp
 from jaxtyping import Float
 
 from refref_jax import atomic_files, configuration
-from refref_jax.optics.scene import Scene
+from refref_jax.optics.media import Scene
 from refref_jax.render import checkpoint_io
 from refref_jax.render.checkpoint_io import (
     PARAMS_ITEM,

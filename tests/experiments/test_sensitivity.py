@@ -25,8 +25,8 @@ def inputs():
     )
 
 
-def _spoilt(inputs, wrong, amount, seed=0):
-    return ERRORS[wrong].spoil(inputs, amount, np.random.default_rng(seed))
+def _perturbed(inputs, wrong, amount, seed=0):
+    return ERRORS[wrong].perturb(inputs, amount, np.random.default_rng(seed))
 
 
 def _degrees(a, b):
@@ -36,33 +36,33 @@ def _degrees(a, b):
 def test_errors_have_the_amount_that_their_unit_says(inputs):
     ball = inputs.parts[0]
     diagonal = 2.0 * math.sqrt(3.0)
-    assert _spoilt(inputs, "index", 0.01).parts[0].index == pytest.approx(ball.index + 0.01)
-    radii = np.linalg.norm(_spoilt(inputs, "vertices", 1.0).parts[0].vertices, axis=1)
+    assert _perturbed(inputs, "index", 0.01).parts[0].index == pytest.approx(ball.index + 0.01)
+    radii = np.linalg.norm(_perturbed(inputs, "vertices", 1.0).parts[0].vertices, axis=1)
     assert np.sqrt(np.mean((radii - 1.0) ** 2)) == pytest.approx(0.01 * diagonal, rel=0.4)
-    tilted = _spoilt(inputs, "normals", 3.0).parts[0]
+    tilted = _perturbed(inputs, "normals", 3.0).parts[0]
     np.testing.assert_array_equal(tilted.vertices, ball.vertices)
     tilt = _degrees(tilted.normals, shaded_mesh(ball).normals)
     assert np.sqrt(np.mean(tilt**2)) == pytest.approx(3.0, rel=0.4)
-    larger = _spoilt(inputs, "size of the object", 3.0).parts[0].vertices
+    larger = _perturbed(inputs, "size of the object", 3.0).parts[0].vertices
     np.testing.assert_allclose(larger, 1.03 * ball.vertices, atol=1e-6)
-    moved = _spoilt(inputs, "place of the object", 1.0).parts[0].vertices - ball.vertices
+    moved = _perturbed(inputs, "place of the object", 1.0).parts[0].vertices - ball.vertices
     np.testing.assert_allclose(np.linalg.norm(moved, axis=1), 0.01 * diagonal, rtol=1e-5)
     extent = inputs.properties.background.extent
-    wrong = _spoilt(inputs, "size of the background", 3.0).properties.background
+    wrong = _perturbed(inputs, "size of the background", 3.0).properties.background
     assert wrong.extent == pytest.approx(1.03 * extent) and wrong.faces
 
 
 def test_turned_objects_and_cameras_are_turned_by_degrees(inputs):
     ball, poses = inputs.parts[0], inputs.frames.cameras.poses
-    turned = _spoilt(inputs, "rotation of the object", 10.0).parts[0].vertices
+    turned = _perturbed(inputs, "rotation of the object", 10.0).parts[0].vertices
     np.testing.assert_allclose(np.linalg.norm(turned, axis=1), 1.0, atol=1e-5)
     assert np.max(_degrees(turned, ball.vertices)) == pytest.approx(10.0, abs=0.1)
-    aimed = _spoilt(inputs, "rotation of the cameras", 3.0).frames.cameras.poses
+    aimed = _perturbed(inputs, "rotation of the cameras", 3.0).frames.cameras.poses
     np.testing.assert_array_equal(aimed[:, :, 3], poses[:, :, 3])
     change = np.einsum("nji,njk->nik", poses[:, :, :3], aimed[:, :, :3])
     angles = np.degrees(np.arccos(0.5 * (np.trace(change, axis1=1, axis2=2) - 1.0)))
     np.testing.assert_allclose(angles, 3.0, atol=1e-3)
-    away = _spoilt(inputs, "place of the cameras", 1.0).frames.cameras.poses - poses
+    away = _perturbed(inputs, "place of the cameras", 1.0).frames.cameras.poses - poses
     share = np.linalg.norm(away[:, :, 3], axis=1) / np.linalg.norm(poses[:, :, 3], axis=1)
     np.testing.assert_allclose(share, 0.01, rtol=0.05)
 
@@ -70,7 +70,7 @@ def test_turned_objects_and_cameras_are_turned_by_degrees(inputs):
 def test_right_inputs_stay_as_they_are(inputs):
     before = inputs.frames.cameras.poses.copy()
     for wrong, error in ERRORS.items():
-        _spoilt(inputs, wrong, error.amounts[-1])
+        _perturbed(inputs, wrong, error.amounts[-1])
     np.testing.assert_array_equal(inputs.frames.cameras.poses, before)
 
 

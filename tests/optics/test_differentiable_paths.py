@@ -14,8 +14,8 @@ from jax.test_util import check_grads
 from refref_jax.optics import path_tracing
 from refref_jax.optics.differentiable_paths import follow_branch
 from refref_jax.optics.light_paths import PathStatus
+from refref_jax.optics.media import Scene
 from refref_jax.optics.path_settings import PAPER, STRAIGHT, TREE, PathSettings
-from refref_jax.optics.scene import Scene
 from tests.factories import scenes
 
 _DEPTH = 4

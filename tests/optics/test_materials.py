@@ -14,10 +14,9 @@ from refref_jax.data.mesh_queries import find_containment
 from refref_jax.data.scene_analysis import analyse
 from refref_jax.optics import fresnel
 from refref_jax.optics.light_paths import PathStatus, exists
-from refref_jax.optics.media import empty_interior_list, interior_length
+from refref_jax.optics.media import empty_interior_list, interior_length, of_channel
 from refref_jax.optics.path_settings import PATH_PRESETS, TREE
 from refref_jax.optics.path_tracing import survey, trace, trace_ends
-from refref_jax.optics.scene import of_channel
 from refref_jax.render import shade
 from tests.factories import scenes
 from tests.factories.small_model import CAMERAS

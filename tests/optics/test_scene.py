@@ -7,7 +7,7 @@ import pytest
 
 from refref_jax.data.scene_assembly import assemble
 from refref_jax.geometry.rays import Rays
-from refref_jax.optics.scene import in_one_precision, with_index
+from refref_jax.optics.media import in_one_precision, with_index
 from tests.factories import scenes
 
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from refref_jax.geometry import cameras
+from refref_jax.optics.media import Scene
 from refref_jax.optics.path_settings import STRAIGHT, TREE
-from refref_jax.optics.scene import Scene
 from refref_jax.render import backdrop, learned_media, pixels, render_known
 from refref_jax.render.backgrounds import (
     Environment,

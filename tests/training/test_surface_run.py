@@ -21,7 +21,8 @@ from refref_jax.render.model import ball_of, look_up_surface
 from refref_jax.sampling.scene_bounds import bounds
 from refref_jax.training import fit, loop, presets, run_folder
 from refref_jax.training.config import TrainConfig
-from refref_jax.training.presets import PRESETS, place_surface
+from refref_jax.training.learned_surface import place as place_surface
+from refref_jax.training.presets import PRESETS
 from tests.factories import scenes
 from tests.factories.small_model import CAMERAS
 from tests.processes.command import ROOT, run_command

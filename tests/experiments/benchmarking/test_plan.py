@@ -63,6 +63,8 @@ def test_methods_are_in_the_order_of_the_table_and_none_hides_a_reconstruction()
         ("msnerf", ()),
         ("neus", ("walls",)),
         ("unisurf", ("walls",)),
+        ("tnsr", ("meshes", "walls")),
+        ("tnsr_true_start", ("meshes", "walls")),
         ("splats", ()),
     ]
     for group in ("main", "ablations"):
@@ -136,7 +138,7 @@ def test_what_a_scene_lacks_is_skipped_and_said(tmp_path, lacks, left, reason):
 
 def test_a_surface_is_for_scenes_with_walls(tmp_path):
     inside = _scene(tmp_path / "inside")
-    assert _planned(inside, "neus,unisurf") == (["neus", "unisurf"], {})
+    assert _planned(inside, "neus,unisurf,tnsr") == (["neus", "unisurf", "tnsr"], {})
     given = dataclasses.replace(inside, options=("--background=unbounded",))
     names, reasons = _planned(given, "straight,neus")
     assert names == ["straight"] and "its background is infinitely far" in reasons["neus"]

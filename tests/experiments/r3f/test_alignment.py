@@ -17,7 +17,7 @@ _BUNDLED = Path(__file__).parents[3] / "experiments" / "data" / "cube_smcvx_ball
 _OWN = Background(None, None, None)
 
 
-def _spoilt(part, *, size=1.03, shift=(0.02, -0.01, 0.03)):
+def _perturbed(part, *, size=1.03, shift=(0.02, -0.01, 0.03)):
     mesh = make_mesh(size * part.vertices + np.array(shift), part.faces)
     return part._replace(vertices=mesh.vertices, normals=None)
 
@@ -31,7 +31,7 @@ def _errors(parts):
 def test_outlines_place_an_object_before_a_field(tmp_path, monkeypatch):
     scene = write_scene(tmp_path / "cube_smcvx_ball", size=64)
     monkeypatch.setattr(index_stage, "learn_backdrop", lambda *_, **options: None)
-    parts = [_spoilt(meshes.read_meshes(scene)[0]._replace(colour_known=True))]
+    parts = [_perturbed(meshes.read_meshes(scene)[0]._replace(colour_known=True))]
     out = tmp_path / "out"
     out.mkdir()
     facts = alignment.align(scene, parts, out, _OWN, seed=0)
@@ -50,7 +50,7 @@ def test_outlines_place_an_object_before_a_field(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_light_places_an_object_within_a_thousandth(tmp_path):
-    parts = [_spoilt(part) for part in meshes.read_meshes(_BUNDLED)]
+    parts = [_perturbed(part) for part in meshes.read_meshes(_BUNDLED)]
     true = meshes.read_meshes(_BUNDLED)[0].vertices
     facts = alignment.align(_BUNDLED, parts, tmp_path, _OWN, seed=0)
     assert facts.light < facts.outlines < 0.3 * facts.given

@@ -1,0 +1,121 @@
+"""TNSR's field: the surface is that of NeuS, and only the field around it is seen."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from refref_jax.fields import neus, registry, tnsr
+from refref_jax.fields.hash_grid import HashGridConfig
+from refref_jax.geometry.surfaces import slope
+from refref_jax.sampling.polylines import Gaussians
+
+_GRID = HashGridConfig(levels=2, base_res=3, max_res=10, hashmap_size=256, features=2)
+_CENTRE, _RADIUS = (0.3, -0.2, 0.1), 2.0
+_TOWARDS = jnp.array([0.36, 0.48, 0.8], jnp.float32)
+
+
+def _config(**changes):
+    return tnsr.TnsrConfig(
+        _GRID,
+        density_width=8,
+        bottleneck=4,
+        colour_width=8,
+        colour_depth=1,
+        around=_GRID,
+        **changes,
+    )
+
+
+def _trained(config):
+    """Returns parameters as after training: large entries, and biases that are not 0."""
+    initial = jax.jit(lambda: registry.init_radiance(jax.random.key(0), config))()
+    rng = np.random.default_rng(1)
+    return jax.tree.map(lambda x: jnp.float32(0.6 * rng.normal(size=x.shape)), initial)
+
+
+def _surface(params, config):
+    return tnsr.level_set(params, config, centre=_CENTRE, radius=_RADIUS)
+
+
+def test_the_initial_surface_is_a_ball():
+    config = _config(start=0.4)
+    params = registry.init_radiance(jax.random.key(0), config)
+    points = jnp.float32(np.random.default_rng(0).uniform(-1.0, 1.0, (50, 3)))
+    found = jax.jit(lambda x: _surface(params, config).values(x))(points)
+    expected = np.linalg.norm(np.asarray(points) - _CENTRE, axis=-1) - 0.4 * _RADIUS
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+def test_values_and_slopes_are_those_of_neus():
+    """Slopes are differences, of values that `neus.radiance` returns for the same parameters."""
+    config = _config()
+    params, surface = _trained(config), _surface(_trained(config), config)
+    opaque, point = tnsr.opaque(config), jnp.array([0.5, 0.3, -0.4], jnp.float32)
+
+    def value(x):
+        cell = (x - jnp.asarray(_CENTRE)) / _RADIUS * config.ball_radius + 0.5
+        seen = neus.radiance(params, opaque, Gaussians(cell[None], jnp.zeros(1)), _TOWARDS)
+        return _RADIUS * seen.signed
+
+    np.testing.assert_allclose(surface.values(point[None])[0], value(point), rtol=1e-5)
+    step = 2.0 * _RADIUS / _GRID.max_res
+    ends = [[value(point + s * step * axis) for axis in jnp.eye(3)] for s in (1.0, -1.0)]
+    expected = (np.array(ends[0]) - np.array(ends[1])) / (2.0 * step)
+    np.testing.assert_allclose(slope(surface, point), expected, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("place", "seen"),
+    [((0.5, 0.5, 0.6), False), ((0.2, 0.1, 0.05), False), ((0.8, 0.9, 0.95), True)],
+    ids=["in the ball", "in front of it", "behind it"],
+)
+def test_light_comes_from_behind_the_ball_only(place, seen):
+    config = _config()
+    params = _trained(config)
+    at = Gaussians(jnp.asarray(place, jnp.float32)[None], jnp.zeros(1, jnp.float32))
+    found = registry.radiance(params, config, at, _TOWARDS)
+    assert (float(found.density) > 0.0) == seen
+    around = neus.radiance(params, tnsr.opaque(config), at, _TOWARDS)
+    if seen:
+        np.testing.assert_allclose(found.density, around.density, rtol=1e-5)
+        np.testing.assert_allclose(found.rgb, around.rgb, rtol=1e-5)
+
+
+def test_an_index_is_learned_within_bounds():
+    given, learned = _config(index=1.4), _config(index=1.4, index_from="learned")
+    params = registry.init_radiance(jax.random.key(0), given)
+    assert params.index_change is None
+    np.testing.assert_allclose(tnsr.index_of(params, given), 1.4, rtol=1e-6)
+    params = registry.init_radiance(jax.random.key(0), learned)
+    move = lambda change: tnsr.index_of(params._replace(index_change=jnp.float32(change)), learned)
+    np.testing.assert_allclose([move(0.0), move(1.0)], [1.4, 1.4 + neus.PACE], rtol=1e-6)
+    np.testing.assert_allclose([move(-1e3), move(1e3)], tnsr.INDICES, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"index": 1.0}, r"index of a surface is 1\.0\. Give a number from 1\.01 to 3"),
+        ({"index": 7.0}, r"index of a surface is 7\.0"),
+        ({"straight": 1.0}, r"share of steps with straight rays is 1\.0\. Give 0 or more, below 1"),
+    ],
+)
+def test_wrong_shapes_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        _config(**changes)
+
+
+def test_the_opaque_field_has_the_same_parameters():
+    config = _config(start=0.3, sharpness=30.0)
+    opaque = tnsr.opaque(config)
+    assert isinstance(opaque, neus.NeusConfig) and tnsr.opaque(opaque) is opaque
+    assert (opaque.start, opaque.sharpness, opaque.around) == (0.3, 30.0, _GRID)
+    one, other = (
+        jax.eval_shape(lambda c=c: registry.init_radiance(jax.random.key(0), c))
+        for c in (config, opaque)
+    )
+    assert jax.tree.structure(one) == jax.tree.structure(other)
+    assert dataclasses.replace(config) == config and hash(config) != hash(opaque)
