@@ -10,7 +10,10 @@
 All but checkpoints and coverage are readable text.
 """
 
+import errno
 import json
+import math
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -40,6 +43,9 @@ from refref_jax.training.loop import TrainState
 _METRICS = "metrics.jsonl"
 _COVERAGE = "coverage.npz"
 _GAINS = "gains.json"
+# Room for the files of a checkpoint that describe its arrays, in bytes.
+_OTHER_FILES = 1 << 20
+
 _LEFT_BEHIND = (_METRICS, _COVERAGE, _GAINS, checkpoint_io.CHECKPOINTS)
 
 
@@ -66,6 +72,7 @@ class Checkpoints:
 
         Raises:
           ValueError: if a parameter is not finite. Existing checkpoints are kept.
+          OSError: if the disk has no room for it. Existing checkpoints are kept.
         """
         step = int(state.step)
         if step == self.newest():
@@ -79,8 +86,11 @@ class Checkpoints:
             PARAMS_ITEM: ocp.args.StandardSave(state.params),
             TRAINING_ITEM: ocp.args.StandardSave(_training_item(state)),
         }
+        _check_space(self._run, state)
         self._manager.save(step, args=ocp.args.Composite(**items), force=True)
         self._manager.wait_until_finished()
+        if jax.process_index() == 0:
+            checkpoint_io.write_checksums(self._run, step)
 
     def restore(self, like: TrainState) -> TrainState:
         """Reads the newest state.
@@ -101,6 +111,18 @@ class Checkpoints:
         )
         training = items[TRAINING_ITEM]
         return TrainState(training["step"], items[PARAMS_ITEM], training["optimizer"])
+
+
+def _check_space(run: Path, state: TrainState) -> None:
+    """Refuses to write a state without room for it: Orbax would leave a part, and print pages."""
+    needed = sum(leaf.nbytes for leaf in jax.tree.leaves(state)) + _OTHER_FILES
+    free = shutil.disk_usage(run).free
+    if free < needed:
+        raise OSError(
+            errno.ENOSPC,
+            f"a checkpoint takes up to {needed / 2**20:.0f} MiB, {free / 2**20:.0f} are free",
+            str(run),
+        )
 
 
 def _abstract(leaf: jax.Array | jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
@@ -255,8 +277,12 @@ def read_coverage(run: Path) -> Float[np.ndarray, "6 side side"]:
             f"{path} does not exist: the run is of an earlier version, or has no backdrop. Train "
             "it again in another folder."
         )
-    with np.load(path) as file:
-        return np.asarray(file["coverage"])
+    try:
+        return atomic_files.read_arrays(path)["coverage"]
+    except (OSError, KeyError, ValueError) as error:
+        raise ValueError(
+            f"{path} cannot be read ({error}). Restore it, or train again in another folder."
+        ) from error
 
 
 def write_gains(run: Path, names: Sequence[str], gains: Float[np.ndarray, "views 3"]) -> None:
@@ -296,15 +322,25 @@ def read_metrics(run: Path) -> list[dict[str, Any]]:
     path = run / _METRICS
     if not path.is_file():
         return []
-    texts = path.read_text(encoding="utf-8").splitlines()
+    texts = path.read_text(encoding="utf-8", errors="replace").splitlines()
     lines = []
     for number, text in enumerate(texts, 1):
         try:
-            lines.append(configuration.parse_json(text))
+            lines.append(_line_of(text))
         except ValueError as error:
             if number == len(texts):
                 break
             raise ValueError(
-                f"Line {number} of {path} is not JSON ({error}). Remove that line."
+                f"Line {number} of {path} is not one of metrics ({error}). Remove that line."
             ) from error
     return lines
+
+
+def _line_of(text: str) -> dict[str, Any]:
+    line = configuration.parse_json(text)
+    if not isinstance(line, dict) or not {"step", "seconds"} <= set(line):
+        raise ValueError("it has no step or no seconds")
+    for name in ("step", "seconds"):
+        if math.isnan(configuration.as_number(line[name])):
+            raise ValueError(f"{name} is {configuration.abridged(line[name])}")
+    return line
