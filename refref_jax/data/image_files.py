@@ -6,6 +6,7 @@ The pixels at the outline of a mask show the object and the background; `well_in
 Every reader raises a `SceneError` that names the file and the remedy.
 """
 
+import warnings
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -129,9 +130,13 @@ def read_size(path: Path) -> tuple[int, int]:
 def _read_header(path: Path) -> tuple[int, int]:
     """Returns height and width of a single image in one of the formats that are read."""
     try:
-        with Image.open(path, formats=_FORMATS) as image:
+        with warnings.catch_warnings(action="error", category=Image.DecompressionBombWarning):
+            image = Image.open(path, formats=_FORMATS)
+        with image:
             (width, height), pictures = image.size, getattr(image, "n_frames", 1)
             mode = image.mode
+    except (Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
+        raise SceneError(f"{path} has more than {_MOST_PIXELS} pixels. Scale it down.") from error
     except Exception as error:  # Pillow raises OSError, SyntaxError and its own
         raise _unreadable_image(path, error) from error
     _refuse_large(path, height, width)
@@ -145,8 +150,8 @@ def _refuse_large(path: Path, height: int, width: int) -> None:
     """Refuses images that would take a gigabyte when they are unpacked."""
     if not 0 < height * width <= _MOST_PIXELS:
         raise SceneError(
-            f"{path} declares {width} x {height} pixels, but at most {_MOST_PIXELS} are read. "
-            "Scale it down."
+            f"{path} has {width} x {height} pixels, but from 1 to {_MOST_PIXELS} are read. Scale "
+            "it down."
         )
 
 

@@ -479,10 +479,10 @@ def _refusal(
 
 
 def _error(keys: tuple[str, ...], sources: Sequence[_Source], complaint: str) -> SceneError:
-    named = keys[:1] + tuple(
-        f"[{key!r}]" if above in ("parts", "faces") else f".{key}"
+    named = [keys[0][:99]] + [
+        f"[{key[:99]!r}]" if above in ("parts", "faces") else f".{key[:99]}"
         for above, key in itertools.pairwise(keys)
-    )
+    ]
     return SceneError(f"{_origin(keys, sources)}: {''.join(named)} {complaint}")
 
 
