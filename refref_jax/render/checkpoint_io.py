@@ -191,7 +191,7 @@ def write_checksums(run: Path, step: int) -> None:
     folder = run / CHECKPOINTS / str(step)
     files = [path for path in sorted(folder.rglob("*")) if path.is_file()]
     with ThreadPoolExecutor() as pool:
-        sums = list(pool.map(_checksum, files))
+        sums = list(pool.map(checksum, files))
     names = (path.relative_to(folder).as_posix() for path in files)
     with atomic_files.written_file(folder / _CHECKSUMS) as draft:
         draft.write_text(json.dumps(dict(zip(names, sums, strict=True)), indent=1) + "\n")
@@ -207,12 +207,12 @@ def _find_damage(folder: Path, items: Iterable[str]) -> str | None:
     except (ValueError, AttributeError, TypeError):
         return _CHECKSUMS
     with ThreadPoolExecutor() as pool:
-        sums = pool.map(_checksum, [folder / name for name in names])
+        sums = pool.map(checksum, [folder / name for name in names])
         changed = (name for name, found in zip(names, sums, strict=True) if found != known[name])
         return next(changed, None)
 
 
-def _checksum(path: Path) -> int | None:
+def checksum(path: Path) -> int | None:
     """Returns the CRC-32 of a file; `None` if it cannot be read."""
     found = 0
     try:

@@ -6,6 +6,7 @@
     {run}/checkpoints/     the newest few states, saved atomically by Orbax
     {run}/gains.json       gain of each training image, RGB, if exposure=per_image
     {run}/coverage.npz     how many pixels see each vertex of a backdrop
+    {run}/images.json      checksums of the training images and cameras
 
 All but checkpoints and coverage are readable text.
 """
@@ -14,6 +15,7 @@ import errno
 import json
 import math
 import shutil
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -25,6 +27,7 @@ import orbax.checkpoint as ocp
 from jaxtyping import Float
 
 from refref_jax import atomic_files, configuration
+from refref_jax.data.scene_folder import Frames
 from refref_jax.optics.scene import Scene
 from refref_jax.render import checkpoint_io
 from refref_jax.render.checkpoint_io import (
@@ -46,7 +49,8 @@ _GAINS = "gains.json"
 # Room for the files of a checkpoint that describe its arrays, in bytes.
 _OTHER_FILES = 1 << 20
 
-_LEFT_BEHIND = (_METRICS, _COVERAGE, _GAINS, checkpoint_io.CHECKPOINTS)
+_IMAGES = "images.json"
+_LEFT_BEHIND = (_METRICS, _COVERAGE, _GAINS, _IMAGES, checkpoint_io.CHECKPOINTS)
 
 
 class Checkpoints:
@@ -256,6 +260,40 @@ def check_unchanged(run: Path, config: TrainConfig, model: SavedModel, scene: Sc
             f"{run} was created with other meshes than those of "
             f"{config.scene.reconstruction or config.scene.path}. Use the original meshes, or "
             "choose another folder."
+        )
+
+
+def check_images(run: Path, frames: Frames) -> None:
+    """Compares the training images with those at the start of the run, when they are recorded.
+
+    Args:
+      run: folder of the run.
+      frames: training images, with their masks, if any; they may have moved.
+
+    Raises:
+      ValueError: if an image, a mask or a camera has changed.
+    """
+    files = dict(zip(frames.names, frames.images, strict=True))
+    masks = zip(frames.names, frames.masks or (), strict=frames.masks is not None)
+    files |= {f"mask of {name}": path for name, path in masks}
+    found = {name: checkpoint_io.checksum(path) for name, path in files.items()}
+    cameras = np.asarray([*frames.cameras.poses.ravel(), frames.cameras.focal], np.float64)
+    found["cameras"] = zlib.crc32(cameras.tobytes())
+    path = run / _IMAGES
+    if not path.is_file():
+        with atomic_files.written_file(path) as draft:
+            draft.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+        return
+    try:
+        known = configuration.parse_json(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged ({error}). Remove it to trust the images.") from error
+    if known != found:
+        names = [name for name in found if name not in known or known[name] != found[name]]
+        raise ValueError(
+            f"{', '.join(names[:3]) or 'The number'} of the training images in "
+            f"{frames.images[0].parent} changed since {run} began. Restore the scene, train in "
+            f"another folder, or remove {path} to go on with the new ones."
         )
 
 
