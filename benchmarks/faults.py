@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import imageio.v3 as iio
-from absl import app, flags
+from absl import app, flags, logging
 
 from benchmarks import faults_commands
 from benchmarks.faults_commands import Command, Ended
@@ -213,7 +213,8 @@ def fill_disk(campaign: Campaign, name: str, share: float) -> None:
     if name == "evaluate":
         whole -= sum(x.stat().st_size for x in campaign.trained.rglob("*"))
     free = max(4096, int(share * whole))
-    fill = f"head -c $(( $(df --output=avail -B1 {place} | tail -1) - {free} )) /dev/zero > {place}/full;"
+    room = f"$(( $(df --output=avail -B1 {place} | tail -1) - {free} ))"
+    fill = f"head -c {room} /dev/zero > {place}/full;"
     script = _script(campaign, name, place, first=fill, between=f"rm {place}/full;")
     on_disk(campaign, name, place, script)
     _judge(campaign, "disk full", name, place, "disk is full")
@@ -360,6 +361,7 @@ def _stop_half_way(campaign: Campaign) -> None:
 
 def main(arguments: list[str]) -> None:
     del arguments
+    logging.set_verbosity(logging.ERROR)  # Orbax tells of every checkpoint that is read
     campaign = Campaign(Path(_OUT.value).resolve())
     if "train" in chosen():
         _stop_half_way(campaign)
