@@ -1,4 +1,4 @@
-"""Claim: after every fault the last state is intact, and the work goes on to the same result.
+"""Claim: after every fault the last state is intact, and the work continues to the same result.
 
     make faults
     python -m benchmarks.faults [--out=FOLDER] [--kills=100] [--only=train,evaluate] [--workers=2]
@@ -8,7 +8,7 @@ and the making of a data set. Each is killed (`kill -9`) at random moments and r
 result is bit for bit that of a command without faults. Then their disk is full, or read-only; two
 processes use a run at once; checkpoints, metrics and scenes are damaged or change under a run; the
 clock jumps; memory is short. Every fault must end in one line without a traceback, and the work
-must go on once its cause is removed. The table says how each try ended; `lost` and `traceback` are
+must continue once its cause is removed. The table says how each try ended; `lost` and `traceback` are
 failures. Small disks are `tmpfs` in a namespace of their own (Linux; `unshare`).
 """
 
@@ -262,7 +262,7 @@ def share_run(campaign: Campaign) -> None:
 
 
 def damage(campaign: Campaign, fault: str, spoil: Callable[[Path], None], *words: str) -> None:
-    """Damages an interrupted run, which must say so; then removes the damage and goes on."""
+    """Damages an interrupted run, which must say so; then removes the damage and continues."""
     out = campaign.work / fault.replace(" ", "_")
     shutil.copytree(campaign.work / "half", out)
     spoil(out)

@@ -293,7 +293,7 @@ def check_images(run: Path, frames: Frames) -> None:
         raise ValueError(
             f"{', '.join(names[:3]) or 'The number'} of the training images in "
             f"{frames.images[0].parent} changed since {run} began. Restore the scene, train in "
-            f"another folder, or remove {path} to go on with the new ones."
+            f"another folder, or remove {path} to continue with the new ones."
         )
 
 

@@ -154,7 +154,7 @@ def test_images_that_change_under_a_run_are_named(tmp_path):
     with pytest.raises(ValueError, match=r"cameras of the training images"):
         run_folder.check_images(tmp_path, turned)
     fewer = frames._replace(names=("r_000",), images=frames.images[:1], masks=None)
-    with pytest.raises(ValueError, match="to go on with the new ones"):
+    with pytest.raises(ValueError, match="to continue with the new ones"):
         run_folder.check_images(tmp_path, fewer)
     (tmp_path / "images.json").write_text("{")
     with pytest.raises(ValueError, match=r"images\.json is damaged"):
