@@ -3,6 +3,7 @@
 # Both create .venv first, and may be repeated. `make dataset-env` installs Blender, which
 # `python -m experiments.dataset.make` renders with, beside it. `make benchmark-small` needs both: it
 # renders eight scenes and compares three methods on them; docs/benchmark.md says how long that takes.
+# `make faults` kills and disturbs commands, and compares what they come to (docs/reliability.md).
 # `make notebooks` executes those of experiments/colab and stores them with what they print and draw.
 
 PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
@@ -27,6 +28,7 @@ PYTEST = $(RUN) pytest --numprocesses=$(PROCESSES) --dist=loadscope --no-loadsco
 DATASET_TESTS := tests/experiments/dataset
 
 .PHONY: demo test test-dataset test-slow lint format clean notebooks dataset-env benchmark-small
+.PHONY: faults
 
 demo: $(READY)
 	$(RUN) experiments.train --scene=experiments/data/cube_smcvx_ball --out=runs/demo --resume
@@ -63,6 +65,9 @@ benchmark-small: $(READY) $(BLENDER_READY)
 		--texture_size=512 --exr=none --workers=2
 	$(RUN) experiments.benchmark --scenes='$(SMALL)/scenes/*' --methods=straight,oracle,tree \
 		--preset=tiny --steps=1250 --rays_per_pixel=4 --out=$(SMALL)/results
+
+faults: $(READY)
+	$(RUN) benchmarks.faults
 
 clean:
 	rm -rf $(VENV) $(BLENDER_VENV) .mypy_cache .pytest_cache .ruff_cache *.egg-info

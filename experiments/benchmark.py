@@ -106,6 +106,7 @@ _OF_JOBS = (
     *(_PRESET, _STEPS, _LIMIT, _RAYS_PER_PIXEL, _SEED, _LPIPS_WEIGHTS),
     *(_JOBS, _RAY, _JOB_CPUS, _JOB_GPUS),
 )
+cli_flags.allow_outside()
 
 
 def main() -> None:

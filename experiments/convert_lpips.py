@@ -22,7 +22,7 @@ from experiments.cli import flags as cli_flags
 with epy.lazy_imports():
     import numpy as np
 
-    from refref_jax import metrics
+    from refref_jax import atomic_files, metrics
 
 _ALEXNET = flags.DEFINE_string(
     "alexnet", None, "State dict of torchvision's AlexNet, .pth or .npz.", required=True
@@ -73,8 +73,7 @@ def read_state_dict(path: Path) -> dict[str, np.ndarray]:
 
 
 def _read_npz(path: Path) -> dict[str, np.ndarray]:
-    with np.load(path, allow_pickle=False) as file:
-        return {name: file[name] for name in file.files}
+    return atomic_files.read_arrays(path)
 
 
 def _reader_of_torch(path: Path) -> Callable[[Path], dict[str, np.ndarray]]:

@@ -55,6 +55,7 @@ _CENTRE = flags.DEFINE_string(
 _SCALE = flags.DEFINE_string(
     "scale", "1", "Factor of all lengths, or auto: mean distance of the cameras to the origin is 4."
 )
+cli_flags.allow_outside()
 
 
 def main() -> None:

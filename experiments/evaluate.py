@@ -48,6 +48,7 @@ _WRITES = ("rgb", "distance", "metrics.json", "comparison.png")
 
 _METHODS = {"paper": "oracle"}
 _RECONSTRUCTED = {"paper": "r3f", "tree": "r3f_tree"}
+cli_flags.allow_outside()
 
 
 def main() -> None:

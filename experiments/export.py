@@ -70,6 +70,7 @@ _BOX = flags.DEFINE_float(
     "Half-extent of the box around the model's centre, world units; that of the model by default.",
     1e-6,
 )
+cli_flags.allow_outside()
 
 
 def main() -> None:

@@ -68,6 +68,7 @@ _IOR = cli_flags.ior()
 _RAYS_PER_PIXEL = cli_flags.rays_per_pixel(9)
 _SPLIT = cli_flags.split("Views to render.")
 _OVERWRITE = cli_flags.overwrite("the figures of an earlier call")
+cli_flags.allow_outside()
 
 
 def main() -> None:

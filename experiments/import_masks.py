@@ -30,6 +30,7 @@ with epy.lazy_imports():
 _SCENE = flags.DEFINE_string("scene", None, "The scene, in the local layout.", required=True)
 _MASKS = flags.DEFINE_string("masks", None, "Folder of the masks.", required=True)
 _OUT = cli_flags.out("Copy to write, which must not exist.")
+cli_flags.allow_outside()
 
 
 def main() -> None:

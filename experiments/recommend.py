@@ -47,6 +47,7 @@ _TABLE = flags.DEFINE_string("table", str(_BUNDLED), "Table of a sweep, trade_of
 _TIMED_STEPS = flags.DEFINE_integer(
     "timed_steps", 96, "Steps to time; the first third, which includes compilation, is dropped.", 6
 )
+cli_flags.allow_outside()
 
 
 def main() -> None:

@@ -31,6 +31,7 @@ _RECONSTRUCTION = r3f_flags.reconstruction()
 _SPACE = r3f_flags.space()
 _PROPERTIES = cli_flags.properties()
 _SEED = cli_flags.seed()
+cli_flags.allow_outside()
 
 
 def _parse(word: str | None) -> float | None:

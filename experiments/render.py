@@ -45,6 +45,7 @@ _CHUNK = cli_flags.chunk()
 _OVERWRITE = cli_flags.overwrite("earlier images of these views")
 
 _WRITES = ("rgb", "distance", "rgb.gif", "rgb.mp4", "distance.gif", "distance.mp4")
+cli_flags.allow_outside()
 
 
 def main() -> None:

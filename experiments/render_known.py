@@ -74,6 +74,7 @@ _WRITES = ("rgb", "comparison.png", "metrics.json")
 
 # Keys that identify a file of this command.
 _KEYS = {"scene", "paths", "views", "casts_per_pixel"}
+cli_flags.allow_outside()
 
 
 def main() -> None:

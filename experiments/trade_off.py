@@ -67,6 +67,7 @@ app.check(_VALUES, options.parse_values)
 _POINTS = flags.DEFINE_list("points", None, "Points to measure with the base, as in max_bends=6.")
 _LIMIT = cli_flags.limit()
 _DRY_RUN = flags.DEFINE_bool("dry_run", False, "List the points without measuring them.")
+cli_flags.allow_outside()
 
 
 def main() -> None:

@@ -37,6 +37,7 @@ _RESUME = flags.DEFINE_bool("resume", False, "Continue the run in --out, if ther
 _LOG_EVERY = flags.DEFINE_integer("log_every", 50, "Steps between two lines of metrics.", 1)
 _CHECKPOINT_EVERY = flags.DEFINE_integer("checkpoint_every", 500, "Steps between checkpoints.", 1)
 _KEEP = flags.DEFINE_integer("keep", 2, "Number of newest checkpoints to keep.", 1)
+cli_flags.allow_outside()
 
 
 def main() -> None:

@@ -40,6 +40,7 @@ _HEIGHTS = flags.DEFINE_list(
     "Widths are 16/9 of them.",
 )
 _CHUNK = cli_flags.chunk()
+cli_flags.allow_outside()
 
 
 def main() -> None:

@@ -10,12 +10,14 @@ The leaves of a tree of dataclasses can be options (`option`), which are accesse
 (`options_of`).
 """
 
+import collections
 import dataclasses
 import difflib
 import json
 import math
 import numbers
 import os
+import reprlib
 import sys
 import textwrap
 import types
@@ -52,6 +54,15 @@ FORMER_VALUES = "former_values"
 NOT_FINITE = ("inf", "-inf", "nan")
 """Names of the numbers that JSON does not support."""
 
+# Levels of nesting in a file that is read: every format here has fewer than ten.
+_DEEPEST = 64
+
+# Characters of a word that are compared with others, which takes time proportional to their square.
+_LONGEST_WORD = 80
+
+_ABRIDGED = reprlib.Repr()
+_ABRIDGED.maxlevel, _ABRIDGED.maxlist, _ABRIDGED.maxstring, _ABRIDGED.maxlong = 4, 8, 80, 40
+
 
 def write(path: Path, config: Any) -> None:
     """Writes a configuration as indented JSON, atomically."""
@@ -64,12 +75,37 @@ def parse_json(text: str | bytes) -> Any:
     """Parses JSON text from untrusted files.
 
     Raises:
-      ValueError: if the text is not JSON, or is nested too deeply.
+      ValueError: if the text is not JSON, is nested too deeply, or has a key twice.
     """
     try:
-        return json.loads(text)
+        found = json.loads(text, object_pairs_hook=_unique)
     except RecursionError as error:
         raise ValueError("it is nested too deeply") from error
+    level = [found]
+    for _ in range(_DEEPEST):
+        level = [inner for each in level for inner in _inside(each)]
+    if level:
+        raise ValueError("it is nested too deeply")
+    return found
+
+
+def _inside(value: Any) -> Iterable[Any]:
+    if isinstance(value, dict):
+        return value.values()
+    return value if isinstance(value, list) else ()
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        counts = collections.Counter(key for key, _ in pairs)
+        raise ValueError(f"it has the key {abridged(counts.most_common(1)[0][0])} twice")
+    return found
+
+
+def abridged(value: Any) -> str:
+    """Returns a value of a file as text for messages, shortened if it is long."""
+    return _ABRIDGED.repr(value)
 
 
 def string_safe(value: Any) -> Any:
@@ -155,9 +191,9 @@ def convert_fields(record: Any) -> None:
             raise ValueError(f"{name} is {value!r}, not of type {kind.__name__}.")
 
 
-def nearest(word: str, words: Iterable[str]) -> str | None:
-    """Returns the most similar of some words, or `None` if none is similar."""
-    found = difflib.get_close_matches(word, list(words), 1)
+def nearest(word: str, words: Iterable[str], *, similarity: float = 0.6) -> str | None:
+    """Returns the most similar of some words, or `None` if none is similar enough."""
+    found = difflib.get_close_matches(word[:_LONGEST_WORD], list(words), 1, similarity)
     return found[0] if found else None
 
 
@@ -301,7 +337,7 @@ def _build(kind: Any, value: Any, where: str, variants: Variants) -> Any:
         return _build_tuple(arguments, value, where, variants)
     if origin is typing.Literal:
         if not any(value == option and type(value) is type(option) for option in arguments):
-            raise ValueError(f"{where} is {value!r}, not one of {arguments}")
+            raise ValueError(f"{where} is {abridged(value)}, not one of {arguments}")
         return value
     if origin in (typing.Union, types.UnionType):
         if value is None and type(None) in arguments:
@@ -317,7 +353,7 @@ def _build(kind: Any, value: Any, where: str, variants: Variants) -> Any:
     if value != value:
         raise ValueError(f"{where} is NaN, not a number")
     if type(value) is not kind:
-        raise ValueError(f"{where} is {value!r}, not of type {kind.__name__}")
+        raise ValueError(f"{where} is {abridged(value)}, not of type {kind.__name__}")
     return value
 
 
@@ -329,12 +365,13 @@ def _check_text(value: str, where: str) -> None:
     except UnicodeEncodeError:
         possible = False
     if not possible:
-        raise ValueError(f"{where} is {value!r}, which holds a character that no name can have")
+        shown = abridged(value)
+        raise ValueError(f"{where} is {shown}, which holds a character that no name can have")
 
 
 def _build_dataclass(kind: Any, value: Any, where: str, variants: Variants) -> Any:
     if not isinstance(value, dict):
-        raise ValueError(f"{where} is {value!r}, not an object")
+        raise ValueError(f"{where} is {abridged(value)}, not an object")
     kind = _variant(variants[kind], value, where) if kind in variants else kind
     hints = typing.get_type_hints(kind)
     fields = dataclasses.fields(kind)
@@ -355,7 +392,7 @@ def _unknown(key: str, hints: Mapping[str, Any]) -> str:
         if dataclasses.is_dataclass(kind) and key in {f.name for f in dataclasses.fields(kind)}:
             return f"{key!r}, which belongs in {section!r}"
     near = nearest(key, hints)
-    return f"{key!r}" + (f": did you mean {near!r}?" if near else "")
+    return abridged(key) + (f": did you mean {near!r}?" if near else "")
 
 
 def _with_present_names(
@@ -384,7 +421,7 @@ def _build_tuple(
     arguments: tuple[Any, ...], value: Any, where: str, variants: Variants
 ) -> tuple[Any, ...]:
     if not isinstance(value, list):
-        raise ValueError(f"{where} is {value!r}, not a list")
+        raise ValueError(f"{where} is {abridged(value)}, not a list")
     if len(arguments) == 2 and arguments[1] is Ellipsis:
         arguments = (arguments[0],) * len(value)
     if len(arguments) != len(value):
@@ -441,10 +478,11 @@ def vector_within(least: float, most: float, wanted: str) -> Callable[[Any], Vec
 
 
 def of_type(kind: type, wanted: str) -> Callable[[Any], Any]:
-    """Returns a check of the type of a value; text is not empty."""
+    """Returns a check of the type of a value; text is not empty, and a number has 32 bits."""
 
     def check(value: Any) -> Any:
-        if type(value) is not kind or value == "" or "\0" in str(value):
+        wide = type(value) is int and abs(value) >= 2**31
+        if type(value) is not kind or value == "" or "\0" in str(value) or wide:
             raise UnsuitableError(wanted)
         return value
 

@@ -41,6 +41,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from refref_jax import atomic_files
 from refref_jax.numerics import host_array, safe_divide, safe_sqrt
 
 SMALLEST_FOR_SSIM = 11
@@ -352,9 +353,8 @@ def read_lpips(path: Path) -> dict[str, np.ndarray]:
         invalid values, see `choose`.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-    except Exception as error:  # NumPy passes on errors of zipfile, zlib and the tokenizer
+        arrays = atomic_files.read_arrays(path)
+    except (OSError, ValueError) as error:
         raise ValueError(
             f"{path} cannot be read as weights of LPIPS ({error}). Give a .npz file of "
             "them; docs/metrics.md says how to make it."

@@ -6,6 +6,7 @@ flags are reported immediately.
 """
 
 import difflib
+import errno
 import importlib
 import importlib.util
 import os
@@ -19,12 +20,32 @@ from typing import Any, NoReturn, Self
 
 from absl import app, flags, logging
 
+from refref_jax.data import ALLOW_OUTSIDE
+
 INTERRUPTED = 130
 """Exit status of a command that was stopped by Ctrl-C, as in shells."""
 
 
 STOP_WITH_INPUT = "REFREF_STOP_WITH_INPUT"
 """Environment variable: if it is set, a command stops when its standard input ends."""
+
+
+# Errors of a full disk, and words in errors of JAX on a lack of memory.
+_NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
+_NO_MEMORY = ("RESOURCE_EXHAUSTED", "Out of memory", "bad_alloc", "Cannot allocate memory")
+
+# Flags on which the memory of a command depends, by how much.
+_TAKE_MEMORY = (
+    "batch",
+    "pretraced_batches",
+    "chunk",
+    "gaussians",
+    "most_pixels",
+    "heights",
+    "resolution",
+)
+
+_LONGEST_REASON = 200
 
 
 # `refref_jax.compilation.TRAVERSAL`, whose module imports JAX.
@@ -46,16 +67,21 @@ def run(main: Callable[..., None], *, arguments: Sequence[str] = (), again: str 
     def guarded(words: Sequence[str]) -> None:
         if os.environ.pop(STOP_WITH_INPUT, ""):
             threading.Thread(target=_stop_with_input, daemon=True).start()
-        logging.set_verbosity(logging.ERROR)
+        logging.set_verbosity(logging.FATAL)  # what Orbax logs as an error it raises, too
         refuse_words(module, words[1:], arguments)
         if importlib.util.find_spec("jax_plugins"):  # JAX may run on a GPU
             importlib.import_module("refref_jax.compilation").add_missing_flag()
         try:
+            if "allow_outside" in flags.FLAGS and flags.FLAGS["allow_outside"].value:
+                os.environ[ALLOW_OUTSIDE] = "1"  # other processes that this one starts inherit it
             if _TRAVERSAL in os.environ:
                 importlib.import_module("refref_jax.compilation").chosen_traversal()
             main(*words[1:])
-        except (ValueError, OSError) as error:
-            fail(str(error))
+        except Exception as error:
+            told = _shortage(error, module, again)
+            if told is None and not isinstance(error, ValueError | OSError):
+                raise
+            fail(told or str(error))
 
     try:
         app.run(guarded, flags_parser=parse)
@@ -65,6 +91,23 @@ def run(main: Callable[..., None], *, arguments: Sequence[str] = (), again: str 
         sys.stderr.flush()
         # Not `sys.exit`: XLA may be compiling on other threads, and crashes at interpreter exit.
         os._exit(INTERRUPTED)
+
+
+def _shortage(error: BaseException, module: ModuleType, again: str) -> str | None:
+    """Returns what a full disk or a lack of memory means for the user; `None` for other errors."""
+    reasons = [error]
+    for each in reasons:  # it grows
+        inner = (each.__cause__, each.__context__, *getattr(each, "exceptions", ()))
+        reasons += [other for other in inner if other is not None and other not in reasons]
+    texts = [" ".join(str(each).split())[:_LONGEST_REASON] for each in reasons]
+    for each, text in zip(reasons, texts, strict=True):
+        if getattr(each, "errno", None) in _NO_SPACE or "No space left" in str(each):
+            return f"The disk is full ({text}). Make space. {again[:1].upper()}{again[1:]}".strip()
+        if isinstance(each, MemoryError) or any(word in text for word in _NO_MEMORY):
+            names = [f"--{name}" for name in _TAKE_MEMORY if name in flags_of(module)]
+            lower = f"Lower {' or '.join(names)}, or use" if names else "Use"
+            return f"Memory ran out ({text or 'MemoryError'}). {lower} smaller images and meshes."
+    return None
 
 
 def parse(words: Sequence[str]) -> list[str]:

@@ -87,6 +87,12 @@ def scene(what: str, *, required: bool = True) -> flags.FlagHolder[str]:
     return flags.DEFINE_string("scene", None, f"{what}: {SCENE_FORMS}.", required=required)
 
 
+def allow_outside() -> flags.FlagHolder[bool]:
+    """Defines `--allow_outside`, which `app.run` tells the readers of scenes."""
+    what = "Read files that a scene names outside of its folder. Only for scenes that you trust."
+    return flags.DEFINE_bool("allow_outside", False, what)
+
+
 def out(what: str) -> flags.FlagHolder[str]:
     """Defines `--out`, which is required."""
     holder = flags.DEFINE_string("out", None, what, required=True)

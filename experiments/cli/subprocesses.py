@@ -24,6 +24,9 @@ from experiments.cli import app
 _RSS_UNIT = 1.0 if sys.platform == "darwin" else 1024.0
 _MIB = 2.0**20
 
+# Signals that end a process that finds no memory.
+_NO_MEMORY = (signal.SIGABRT, signal.SIGKILL)
+
 # Seconds between two polls of a command.
 _POLL = 0.05
 
@@ -140,5 +143,6 @@ def _complaint(printed: str, code: int) -> str:
     if errors:
         return errors[-1]
     if code < 0:
-        return f"killed by {signal.Signals(-code).name}"
+        told = f"killed by {signal.Signals(-code).name}"
+        return f"{told}, as when memory runs out: lower --batch" if -code in _NO_MEMORY else told
     return lines[-1] if lines else f"ended with status {code}, and printed nothing"

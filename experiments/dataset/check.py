@@ -47,6 +47,7 @@ _SETTINGS = cli_flags.settings(min_throughput=0.004, max_bends=render_settings.B
 _RAYS_PER_PIXEL = cli_flags.rays_per_pixel(100)
 
 _SHOWN_COMPLAINTS = 3
+cli_flags.allow_outside()
 
 
 def main(folder: str) -> None:

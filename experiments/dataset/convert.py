@@ -32,6 +32,7 @@ _SCENE = cli_flags.scene("Scene to convert, or a folder of scenes")
 _TO = flags.DEFINE_enum("to", None, ["local", "raw", "parquet"], "Layout to write.", required=True)
 _OUT = cli_flags.out("Output folder.")
 _SCENES = flags.DEFINE_list("scenes", None, "Names of the scenes to convert; all if not given.")
+cli_flags.allow_outside()
 
 
 def main() -> None:

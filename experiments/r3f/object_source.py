@@ -9,10 +9,11 @@ from pathlib import Path
 
 from etils import epy
 
+from experiments.r3f import records
 from experiments.r3f.records import IndexFacts, PartFacts, Reconstruction
 from refref_jax import configuration
 from refref_jax.choices import Material
-from refref_jax.data import meshes
+from refref_jax.data import file_inside, meshes
 from refref_jax.data.meshes import MeshPart
 from refref_jax.data.scene_assembly import shaded_mesh
 from refref_jax.geometry.triangle_meshes import Mesh, join
@@ -53,9 +54,13 @@ def read(run: Path) -> Provenance | None:
 def surface_file(out: Path, found: Reconstruction) -> Path:
     """Returns the path of the outer surface: the refined one if the refinement was kept."""
     if not _is_refined(found):
-        return out / geometry_stage.FOLDER / found.geometry.mesh
+        return _file(out / geometry_stage.FOLDER, found.geometry.mesh)
     parts = found.light.parts
-    return out / light_stage.FOLDER / (parts[0].mesh if parts else found.geometry.mesh)
+    return _file(out / light_stage.FOLDER, parts[0].mesh if parts else found.geometry.mesh)
+
+
+def _file(folder: Path, mesh: str) -> Path:
+    return file_inside([folder], mesh, where="mesh", path=folder.parent / records.FILE)
 
 
 def _is_refined(found: Reconstruction) -> bool:
@@ -65,7 +70,7 @@ def _is_refined(found: Reconstruction) -> bool:
 def are_there(out: Path, found: Reconstruction) -> bool:
     """Returns whether the files of all parts exist."""
     parts = found.light.parts if _is_refined(found) else ()
-    files = [out / light_stage.FOLDER / part.mesh for part in parts]
+    files = [_file(out / light_stage.FOLDER, part.mesh) for part in parts]
     return all(file.is_file() for file in (*files, surface_file(out, found)))
 
 
@@ -85,10 +90,11 @@ def read_parts(out: Path, found: Reconstruction) -> list[MeshPart]:
 
 
 def _read(folder: Path, facts: PartFacts) -> MeshPart:
-    part = meshes.read_part(folder / facts.mesh, index=facts.index)
+    mesh = _file(folder, facts.mesh)
+    part = meshes.read_part(mesh, index=facts.index)
     if facts.radiance is not None:
         material = Material("opaque", radiance=facts.radiance)
-        radiance = meshes.read_radiance(material, part.faces, path=folder / facts.mesh)
+        radiance = meshes.read_radiance(material, part.faces, path=mesh)
         return part._replace(material=material, radiance=radiance)
     if facts.tint is None:
         return part

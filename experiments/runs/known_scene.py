@@ -105,6 +105,7 @@ def read_scene(
     chosen = view_numbers.choose(views, len(frames.names))
     properties = scene_properties.read(scene, overlay=overlay)
     parts = meshes.read_meshes(scene, indices=indices, properties=properties)
+    meshes.refuse_missing(parts, properties.origins)
     tree, rule = mesh_queries.find_containment(parts), rule or rule_of(properties)
     notes = mesh_checks.check_meshes(parts, tree, rule=rule)
     if properties.rule is not None and properties.rule == rule:

@@ -3,20 +3,28 @@
 Every page has its own camera, panel and scene, and a thread that draws the images scheduled by
 `session`. Pages take turns: one image is drawn at a time.
 
+viser serves anyone who can reach it. `_guard` refuses pages of other sites that a browser shows
+beside this one, names that lead to this machine from outside, large messages, and more pages than
+can be drawn.
+
 This is the only module that imports viser.
 """
 
 import contextlib
+import http
 import io
+import logging
 import math
 import threading
 import time
 import traceback
-from collections.abc import Iterator
+import urllib.parse
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 import viser
+import websockets.asyncio.server
 
 from experiments.viewer import cameras, controls, layers, session
 from experiments.viewer.cameras import Viewpoint
@@ -27,6 +35,12 @@ from refref_jax.geometry.rays import Rays
 from refref_jax.render import pixel_paths
 
 _JPEG_QUALITY = 92
+
+# Names of this machine in the address of a page, if the server listens to nobody else.
+_LOOPBACK = ("127.0.0.1", "::1", "localhost")
+
+# Pages at once, and bytes of a message of a page, which only tells cameras, clicks and options.
+_MOST_PAGES, _LONGEST_MESSAGE = 32, 1 << 20
 
 # Closer to a test view than this, a browser's camera is not moved.
 _NEAR = 10 * cameras.ROUNDING
@@ -50,7 +64,7 @@ def serve(subject: Subject, *, host: str, port: int) -> viser.ViserServer:
       host: address to listen on.
       port: first port to try; the server's method `get_port` returns the actual one.
     """
-    with contextlib.redirect_stdout(io.StringIO()):  # viser prints a box
+    with contextlib.redirect_stdout(io.StringIO()), _guard(host):  # viser prints a box
         server = viser.ViserServer(host=host, port=port, label=subject.name, verbose=False)
     # Sharing would expose the page to the internet, through a server of viser's authors.
     server.gui.configure_theme(show_share_button=False, show_logo=False)
@@ -74,6 +88,55 @@ def serve(subject: Subject, *, host: str, port: int) -> viser.ViserServer:
             page.close()
 
     return server
+
+
+@contextlib.contextmanager
+def _guard(host: str) -> Iterator[None]:
+    """Makes a server that starts in the context refuse requests, as the module says."""
+    original, pages = websockets.asyncio.server.serve, 0
+    # It prints a traceback when a message is malformed, and closes that connection.
+    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
+
+    def serve(handler: Any, *address: Any, process_request: Any, **options: Any) -> Any:
+        async def counted(connection: Any) -> None:
+            nonlocal pages
+            pages += 1
+            try:
+                await handler(connection)
+            finally:
+                pages -= 1
+
+        def checked(connection: Any, request: Any) -> Any:
+            if told := refusal(request.headers, host=host, pages=pages):
+                return connection.respond(http.HTTPStatus.FORBIDDEN, f"{told}\n")
+            return process_request(connection, request)
+
+        options |= {"process_request": checked, "max_size": _LONGEST_MESSAGE}
+        return original(counted, *address, **options)
+
+    websockets.asyncio.server.serve = serve
+    try:
+        yield
+    finally:
+        websockets.asyncio.server.serve = original
+
+
+def refusal(headers: Mapping[str, str], *, host: str, pages: int) -> str | None:
+    """Returns why a request is refused; `None` if it is not.
+
+    Args:
+      headers: headers of the request.
+      host: address that the server listens on.
+      pages: number of pages that are open.
+    """
+    asked, origin = headers.get("Host", ""), headers.get("Origin")
+    if host in _LOOPBACK and urllib.parse.urlsplit(f"//{asked}").hostname not in _LOOPBACK:
+        return f"The viewer answers to localhost only, not to {asked}."
+    if origin is not None and urllib.parse.urlsplit(origin).netloc != asked:
+        return f"A page of {origin} may not use the viewer."
+    if headers.get("Upgrade", "").lower() == "websocket" and pages >= _MOST_PAGES:
+        return f"{pages} pages are open. Close one first."
+    return None
 
 
 class Page:

@@ -33,7 +33,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from refref_jax.choices import ORIGIN, Position, Space, Split
-from refref_jax.data import image_files, scene_folder, scene_names
+from refref_jax.data import SceneError, image_files, scene_folder, scene_names
 from refref_jax.data.scene_properties import SceneProperties
 from refref_jax.geometry.cameras import Cameras, planar_directions
 
@@ -274,6 +274,7 @@ def find_bounds(
     radius: float | None,
     centre: Position | None = None,
     measure: Callable[[Kind, Position], tuple[float, float] | None] = lambda kind, centre: None,
+    cameras: Cameras | None = None,
 ) -> Bounds:
     """Determines the background of a scene: from `scene.json`, else from its name and depth maps.
 
@@ -285,9 +286,10 @@ def find_bounds(
       centre: centre that is given, in place of the scene's own.
       measure: function of shape and centre to the size that the images show, and its standard
         error, or `None`; called if neither `scene.json` nor depth maps tell the size.
+      cameras: cameras, which have to be inside a background of the size that `scene.json` states.
 
     Raises:
-      SceneError: if `scene.json`, a depth map or a mask is broken.
+      SceneError: if `scene.json`, a depth map or a mask is broken, or a camera is outside.
     """
     own, described = properties.space, properties.background
     found: Space = space or own
@@ -296,7 +298,10 @@ def find_bounds(
     known, file = centre or described.centre, properties.origins.get("background")
     stated = file.name if file else ""
     if described.extent is not None:
-        return Bounds(found, described.extent, stated, centre=known or ORIGIN)
+        bounds = Bounds(found, described.extent, stated, centre=known or ORIGIN)
+        if cameras is not None and radius is None:
+            _refuse_outside(cameras, bounds, described.extent, file)
+        return bounds
     is_sphere = scene_names.of_folder(scene).split("_")[0] == "sphere"
     if space is None and own == "bounded" and is_sphere and described.kind is None:
         found = "spherical"
@@ -315,6 +320,20 @@ def find_bounds(
         return unmeasured._replace(notes=_unfit_warnings(kind, samples))
     source = f"measured from depth maps: {fit.describe()}"
     return Bounds(found, fit.size, source, centre=fit.centre)
+
+
+def _refuse_outside(cameras: Cameras, bounds: Bounds, size: float, file: Path | None) -> None:
+    """Refuses cameras outside of the background, which would look at it from behind."""
+    offsets = np.abs(cameras.poses[:, :, 3] - np.asarray(bounds.centre))
+    sphere = bounds.space == "spherical"
+    reach = np.linalg.norm(offsets, axis=1) if sphere else np.max(offsets, axis=1)
+    if reach.max() >= size:
+        key = "radius" if sphere else "half_extent"
+        raise SceneError(
+            f"{file}: background.{key} is {size:g}, but camera {int(reach.argmax())} is "
+            f"{reach.max():.4g} from its centre. Give a larger one, the right centre, or none, so "
+            "that it is measured."
+        )
 
 
 def _unfit_warnings(kind: Kind, samples: DepthSamples | None) -> tuple[str, ...]:

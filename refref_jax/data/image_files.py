@@ -6,12 +6,14 @@ The pixels at the outline of a mask show the object and the background; `well_in
 Every reader raises a `SceneError` that names the file and the remedy.
 """
 
+import warnings
 from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
 import OpenEXR
 from jaxtyping import Bool, Float, UInt8
+from PIL import Image
 from scipy.ndimage import binary_dilation, binary_erosion
 
 from refref_jax.data import SceneError
@@ -30,6 +32,12 @@ DEPTH_STEP = _DEPTH_RANGE / 255.0
 # Neighbours of a pixel, including diagonal ones, within its own image.
 _AROUND = np.ones((1, 3, 3), bool)
 
+# Formats that are read. Pillow knows others, for some of which it starts programs.
+_FORMATS = ("PNG", "JPEG", "BMP", "WEBP")
+
+# Most pixels of an image, and those that are composited at once.
+_MOST_PIXELS, _BLOCK = 1 << 26, 1 << 22
+
 # Renderers write 1e4 or more for rays that hit nothing.
 _DEPTH_OF_A_MISS = 1e4
 
@@ -41,6 +49,12 @@ def read_rgb(path: Path) -> UInt8[np.ndarray, "h w 3"]:
         return np.repeat(pixels[..., None], 3, axis=-1)
     if pixels.shape[-1] == 3:
         return pixels
+    blocks = range(0, len(pixels), max(1, _BLOCK // pixels.shape[1]))
+    return np.concatenate([_over_white(pixels[i : i + blocks.step]) for i in blocks])
+
+
+def _over_white(pixels: UInt8[np.ndarray, "h w channels"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Composites pixels with opacity over white, as the last of 2 or 4 channels."""
     if pixels.shape[-1] == 2:
         pixels = np.concatenate([np.repeat(pixels[..., :1], 3, axis=-1), pixels[..., 1:]], -1)
     alpha = pixels[..., 3:] / 255.0
@@ -102,23 +116,48 @@ def read_size(path: Path) -> tuple[int, int]:
     """Returns height and width of an image or EXR in pixels, without reading its pixels."""
     _require(path)
     if path.suffix != ".exr":
-        try:
-            height, width = iio.improps(path, plugin="pillow").shape[:2]
-            return height, width
-        except Exception as error:  # as in `_read_png`
-            raise _unreadable_image(path, error) from error
+        return _read_header(path)
     try:
         with OpenEXR.File(str(path), header_only=True) as file:
             low, high = file.header()["dataWindow"]
     except Exception as error:  # as in `read_exr`
         raise _unreadable_exr(path, error) from error
-    width, height = high - low + 1
-    return int(height), int(width)
+    width, height = (int(last) - int(first) + 1 for first, last in zip(low, high, strict=True))
+    _refuse_large(path, height, width)
+    return height, width
+
+
+def _read_header(path: Path) -> tuple[int, int]:
+    """Returns height and width of a single image in one of the formats that are read."""
+    try:
+        with warnings.catch_warnings(action="error", category=Image.DecompressionBombWarning):
+            image = Image.open(path, formats=_FORMATS)
+        with image:
+            (width, height), pictures = image.size, getattr(image, "n_frames", 1)
+            mode = image.mode
+    except (Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
+        raise SceneError(f"{path} has more than {_MOST_PIXELS} pixels. Scale it down.") from error
+    except Exception as error:  # Pillow raises OSError, SyntaxError and its own
+        raise _unreadable_image(path, error) from error
+    _refuse_large(path, height, width)
+    if pictures > 1 or mode == "CMYK":
+        wrong = f"has {pictures} pictures" if pictures > 1 else "has the inks of a print (CMYK)"
+        raise SceneError(f"{path} {wrong}. Export one picture as 8-bit RGB.")
+    return height, width
+
+
+def _refuse_large(path: Path, height: int, width: int) -> None:
+    """Refuses images that would take a gigabyte when they are unpacked."""
+    if not 0 < height * width <= _MOST_PIXELS:
+        raise SceneError(
+            f"{path} has {width} x {height} pixels, but from 1 to {_MOST_PIXELS} are read. Scale "
+            "it down."
+        )
 
 
 def read_exr(path: Path) -> Float[np.ndarray, "h w *channels"]:
     """Reads the first part of an EXR: `[h, w]` for one channel, `[h, w, 3]` for RGB."""
-    _require(path)
+    read_size(path)
     try:
         with OpenEXR.File(str(path)) as file:
             channels = {name: channel.pixels for name, channel in file.channels().items()}
@@ -163,6 +202,7 @@ def to_bytes(pixels: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]
 
 def _read_png(path: Path) -> UInt8[np.ndarray, "h w *channels"]:
     _require(path)
+    _read_header(path)
     try:
         pixels = iio.imread(path, plugin="pillow")
     except Exception as error:  # Pillow raises OSError, SyntaxError and its own

@@ -24,7 +24,7 @@ import trimesh
 from jaxtyping import Float, Int
 
 from refref_jax.choices import CLEAR, NO_ABSORPTION, Colour, Material, ShadingOverride
-from refref_jax.data import SceneError, image_files, scene_names, scene_properties
+from refref_jax.data import FARTHEST, SceneError, image_files, scene_names, scene_properties
 from refref_jax.data.scene_properties import PartDescription, SceneProperties, Shading
 
 _HEADER = """ply
@@ -59,6 +59,8 @@ INDEX_OF_REFRACTION: dict[str, float] = {
 """Indices of refraction of the data set's materials."""
 
 _LONGEST_HEADER = 1 << 16
+
+_OTHER_MESHES = (".glb", ".gltf", ".obj", ".off", ".stl")
 
 
 def write_mesh(
@@ -181,6 +183,23 @@ def read_meshes(
     ]
 
 
+def refuse_missing(parts: Sequence[MeshPart], origins: Mapping[str, Any]) -> None:
+    """Refuses a scene without meshes whose properties describe some.
+
+    Args:
+      parts: parts of the scene.
+      origins: names or paths of the files that define its properties, see `SceneProperties`.
+
+    Raises:
+      SceneError: if there is no part, but a file describes one.
+    """
+    if (lost := sorted(name for name in origins if name.lower().endswith(".ply"))) and not parts:
+        raise SceneError(
+            f"{origins[lost[0]]} describes {lost[0]}, but the scene's folder meshes holds no mesh. "
+            "Restore it, remove the description, or use paths=straight."
+        )
+
+
 def check_index(name: str, index: float) -> None:
     """Refuses an invalid index of refraction.
 
@@ -208,14 +227,21 @@ def mesh_files(scene: Path) -> list[Path]:
 
     They are `meshes/*.ply` in its folder. If a folder of the raw release has none, they are those
     of `published_meshes` in `mesh_files/{category}` next to `image_data`.
+
+    Raises:
+      SceneError: if there are only meshes in another format.
     """
     folder, name = scene / "meshes", None
     if not folder.is_dir() and (name := scene_names.of_raw_folder(scene)) is not None:
         places = [above / "mesh_files" for above in scene.resolve().parents[2:4]]
         category = scene_names.CATEGORIES[name.category]
         folder = next((each for each in places if each.is_dir()), folder) / category
-    found = folder.iterdir() if folder.is_dir() else ()
-    paths = sorted(path for path in found if path.suffix.lower() == ".ply")
+    if folder.exists() and not folder.is_dir():
+        raise SceneError(f"{folder} is not a folder. Restore the folder of meshes, or remove it.")
+    found = sorted(folder.iterdir()) if folder.is_dir() else []
+    paths = [path for path in found if path.suffix.lower() == ".ply"]
+    if not paths and (other := [each for each in found if each.suffix.lower() in _OTHER_MESHES]):
+        raise SceneError(f"{other[0]} is not a PLY file. Export the mesh as PLY, or remove it.")
     return paths if name is None else published_meshes(name.object, paths)
 
 
@@ -263,7 +289,7 @@ def read_mesh(path: Path) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 
       SceneError: if the file is broken, or has no triangle.
     """
     try:
-        mesh = trimesh.load_mesh(path, process=False)
+        mesh = _load(path)
         vertices = np.asarray(mesh.vertices, np.float64)
         faces = np.asarray(mesh.faces, np.int64).reshape(-1, 3)
     except Exception as error:  # trimesh raises errors of many types for broken files
@@ -293,8 +319,17 @@ def merge_corners(
         )
     if not np.all(np.isfinite(vertices)):
         raise SceneError(f"{name} has a vertex that is not finite. Clean the mesh.")
+    if np.max(np.abs(vertices)) > FARTHEST:
+        raise SceneError(
+            f"{name} has a vertex beyond {FARTHEST:g} world units. Move or scale the scene."
+        )
     vertices, index = np.unique(vertices, axis=0, return_inverse=True)
     return vertices, index.reshape(-1)[faces]
+
+
+def _load(path: Any) -> Any:
+    """Returns the mesh of a file, without the textures that it may name."""
+    return trimesh.load_mesh(path, process=False, skip_materials=True)
 
 
 def _declared_faces(path: Path) -> int:
@@ -335,7 +370,7 @@ def read_radiance(
         return None
     if material.radiance != "vertex_colours":
         return np.broadcast_to(np.asarray(material.radiance, np.float64), (len(faces), 3, 3))
-    mesh = trimesh.load_mesh(path, process=False) if isinstance(path, str | os.PathLike) else path
+    mesh = _load(path) if isinstance(path, str | os.PathLike) else path
     visual: Any = getattr(mesh, "visual", None)
     if getattr(visual, "kind", None) != "vertex":
         raise SceneError(

@@ -33,11 +33,24 @@ from jaxtyping import Bool, Float, UInt8
 
 from refref_jax import atomic_files, configuration
 from refref_jax.choices import SPLITS
-from refref_jax.data import SceneError, image_files
+from refref_jax.data import FARTHEST, SceneError, file_inside, image_files
 from refref_jax.geometry.cameras import Cameras, focal_length, planar_depth_to_distance
 
 # Poses are stored with at least six digits; a larger deviation is a scale or a shear.
 _ROTATION_TOLERANCE = 1e-3
+
+# Keys of a transforms file and of its frames; of others, those that are as similar are refused.
+_FILE = "file_path"
+_KEYS = ("camera_angle_x", "frames")
+_FRAME_KEYS = (_FILE, "mask_file_path", "depth_file_path", "transform_matrix")
+_MISSPELT = 0.9
+_NAME_IN_NERFSTUDIO = {"mask_path": "mask_file_path"}
+
+# Smallest field of view, radians; relative difference of lenses that count as the same.
+_NARROWEST, _SAME_LENS = 1e-4, 2e-3
+
+# Characters of a name in a message.
+_LONGEST_SHOWN = 100
 
 TRANSFORMS = "transforms_{}.json"
 """Pattern of the name of a split's transforms file."""
@@ -54,7 +67,7 @@ def read_json(path: Path) -> dict[str, Any]:
             "transforms_train.json, transforms_val.json and transforms_test.json."
         )
     try:
-        content = configuration.parse_json(path.read_text(encoding="utf-8"))
+        content = configuration.parse_json(path.read_text(encoding="utf-8-sig"))
     except ValueError as error:
         raise SceneError(f"{path} is not valid JSON ({error}). Copy it again.") from error
     if not isinstance(content, dict):
@@ -73,16 +86,18 @@ def get_text(record: Any, name: str, path: Path) -> str:
     """Returns a required string of a record of a file."""
     text = get(record, name, path)
     if not isinstance(text, str):
-        raise SceneError(f"{name} is {text!r} in {path}. Use the name of a file.")
+        shown = configuration.abridged(text)
+        raise SceneError(f"{name} is {shown} in {path}. Use the name of a file.")
     return text
 
 
 def rigid_motion(matrix: Any, name: str, path: Path) -> Float[np.ndarray, "3 4"]:
     """Returns the upper three rows of a 4 x 4 rotation and translation."""
-    try:
-        pose = np.asarray(matrix, np.float64)
-    except (TypeError, ValueError):
-        pose = np.empty(0)
+    name = name[:_LONGEST_SHOWN]
+    rows = matrix if isinstance(matrix, list) else []
+    square = len(rows) == 4 and all(isinstance(row, list) and len(row) == 4 for row in rows)
+    numbers = [[configuration.as_number(x) for x in row] for row in rows if square]
+    pose = np.asarray(numbers, np.float64)
     if pose.shape != (4, 4) or not np.all(np.isfinite(pose)):
         raise SceneError(
             f"The transform_matrix of {name} in {path} is not a finite 4 x 4 matrix. Export the "
@@ -99,6 +114,11 @@ def rigid_motion(matrix: Any, name: str, path: Path) -> Float[np.ndarray, "3 4"]
         raise SceneError(
             f"The transform_matrix of {name} in {path} is not rigid: its axes are scaled, "
             f"sheared or mirrored (deviation {residual:.2g}). Export the poses without scale."
+        )
+    if np.max(np.abs(pose[:3, 3])) > FARTHEST:
+        raise SceneError(
+            f"The transform_matrix of {name} in {path} has the position {pose[:3, 3]}. Move the "
+            f"scene to the origin: coordinates are at most {FARTHEST:g} world units."
         )
     return pose[:3]
 
@@ -191,14 +211,18 @@ def read_frames(scene: Path, split: str) -> Frames:
     frames = get(content, "frames", path)
     if not isinstance(frames, list) or not frames:
         raise SceneError(f"{path} lists no frames. Add frames, or remove the split.")
-    stems = [get_text(frame, "file_path", path) for frame in frames]
-    images = tuple(scene / f"{stem}.png" for stem in stems)
+    stems = [get(frame, "file_path", path) for frame in frames]
+    for record, known in ((content, _KEYS), *((frame, _FRAME_KEYS) for frame in frames)):
+        _refuse_misspelt(record, known, path)
+    named = (f"{stem}.png" if isinstance(stem, str) else stem for stem in stems)
+    images = tuple(file_inside([scene], name, where=_FILE, path=path) for name in named)
     width, height = _image_size(images[0])
-    angle = get(content, "camera_angle_x", path)
-    if not isinstance(angle, int | float) or not 0.0 < angle < math.pi:
+    angle = configuration.as_number(get(content, "camera_angle_x", path))
+    if not _NARROWEST <= angle <= math.pi - _NARROWEST:
+        shown = configuration.abridged(content["camera_angle_x"])
         raise SceneError(
-            f"camera_angle_x is {angle!r} in {path}. Give the horizontal field of view in "
-            "radians, between 0 and pi."
+            f"camera_angle_x is {shown} in {path}. Give the horizontal field of view in radians, "
+            "between 0 and pi."
         )
     poses = np.stack(
         [
@@ -213,10 +237,42 @@ def read_frames(scene: Path, split: str) -> Frames:
         images=images,
         masks=masks,
         depths=depths and tuple(_prefer_exr(depth) for depth in depths),
-        cameras=Cameras(poses, width, height, focal_length(width, float(angle))),
+        cameras=Cameras(poses, width, height, focal_length(width, angle)),
     )
+    for record in (content, *frames):
+        _refuse_other_lenses(record, result.cameras, path)
     _check_files(result)
     return result
+
+
+def _refuse_misspelt(record: Any, known: Sequence[str], path: Path) -> None:
+    """Refuses keys that resemble one that is missing; other programs may write any other key."""
+    for key in set(record) - set(known):
+        missing = set(known) - set(record)
+        near = configuration.nearest(key, missing, similarity=_MISSPELT)
+        near = _NAME_IN_NERFSTUDIO.get(key, near)
+        if near in missing:
+            raise SceneError(
+                f"{path}: {configuration.abridged(key)} is not a known key. Write {near!r}, or "
+                "remove it."
+            )
+
+
+def _refuse_other_lenses(record: dict[str, Any], cameras: Cameras, path: Path) -> None:
+    """Refuses intrinsics of nerfstudio that contradict this layout's pinhole."""
+    width, height = cameras.width, cameras.height
+    focal = dict.fromkeys(("fl_x", "fl_y"), cameras.focal)
+    centre = {"cx": 0.5 * width, "cy": 0.5 * height, "w": float(width), "h": float(height)}
+    distortion = dict.fromkeys(("k1", "k2", "k3", "k4", "p1", "p2"), 0.0)
+    for key, expected in (focal | centre | distortion).items():
+        value = configuration.as_number(record.get(key, expected))
+        if not math.isclose(value, expected, rel_tol=_SAME_LENS):
+            raise SceneError(
+                f"{path}: {key} is {configuration.abridged(record[key])}, but camera_angle_x and "
+                f"the images mean {expected:g}: this layout has undistorted pinholes with the "
+                "principal point in the middle. Remove the key, or convert the images, as "
+                "docs/data_formats.md explains."
+            )
 
 
 def check_scene(scene: Path, *, needed: Sequence[str] = ("train",)) -> None:
@@ -306,7 +362,7 @@ def _optional_files(
             f"The frame {lacking[0]} of {path} lacks {key!r}, like {len(lacking)} of {len(frames)} "
             "frames. Add it to these, or remove it from all."
         )
-    return tuple(scene / get_text(frame, key, path) for frame in frames)
+    return tuple(file_inside([scene], frame[key], where=key, path=path) for frame in frames)
 
 
 def _prefer_exr(path: Path) -> Path:
@@ -384,7 +440,7 @@ def _add_to_split(scene: Path, path: Path, segment: Segment) -> int:
     frames = get(content, "frames", path)
     for frame in frames:
         stem = get_text(frame, "file_path", path)
-        if Path(stem).is_absolute() or ".." in Path(stem).parts:
+        if Path(stem).is_absolute() or ".." in Path(stem).parts:  # it names a file that is written
             raise SceneError(
                 f"{path} names the image {stem}, which is not in the scene's folder. Move the "
                 "images there, and give their names relative to it."

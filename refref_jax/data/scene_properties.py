@@ -9,8 +9,8 @@ of them are optional.
      "parts": [{"mesh": "meshes/cup_glass.ply", "index": 1.5, "shading": "smooth", "priority": 3,
                 "tint": [0.9, 1.0, 0.9], "absorption": [0.1, 0.0, 0.1]}]}
 
-`docs/data_formats.md` documents every key. Unknown keys, values out of range and properties that
-are not supported yet are errors, except for `RECORDS`, which generators write and nothing reads.
+`docs/data_formats.md` documents every key. Unknown keys (other than `RECORDS`, which generators
+write) and values out of range are errors. Images are in the folder of the file or of the scene.
 
 An overlay holds the properties of a scene whose folder cannot be written to. It is merged key by
 key with `scene.json`, and wins; parts are matched by the file name of their mesh.
@@ -33,7 +33,7 @@ from refref_jax.configuration import (
     one_of,
     vector_within,
 )
-from refref_jax.data import SceneError, scene_names
+from refref_jax.data import FARTHEST, SceneError, file_inside, scene_names
 
 FILE = "scene.json"
 """Name of the file in the scene's folder."""
@@ -175,7 +175,7 @@ def read(scene: Path, *, overlay: str | Path | None = None) -> SceneProperties:
     files = [Path(overlay)] if overlay else []
     if (scene / FILE).is_file():
         files.insert(0, scene / FILE)
-    sources = [_Source(path, _read_file(path)) for path in files]
+    sources = [_Source(path, _read_file(path, scene)) for path in files]
     content: dict[str, Any] = {}
     for source in sources:
         content = _merged(content, source.content)
@@ -188,7 +188,7 @@ def check_file(path: Path) -> None:
     Raises:
       SceneError: if it does not exist or is not valid.
     """
-    source = _Source(path, _read_file(path))
+    source = _Source(path, _read_file(path, None))
     _checked(source.content, _TOP, (), [source])
     _checked(source.content.get("background", {}), _BACKGROUND, ("background",), [source])
     for name, part in source.content.get("parts", {}).items():
@@ -212,7 +212,7 @@ class _Source(NamedTuple):
     content: dict[str, Any]
 
 
-def _read_file(path: Path) -> dict[str, Any]:
+def _read_file(path: Path, scene: Path | None) -> dict[str, Any]:
     if not path.is_file():
         raise SceneError(f"{path} does not exist. Give a JSON file of properties like {FILE}.")
     try:
@@ -230,14 +230,17 @@ def _read_file(path: Path) -> dict[str, Any]:
         walls = faces.values() if isinstance(faces, dict) else ()
         for record in (background, *(wall for wall in walls if isinstance(wall, dict))):
             if isinstance(image := record.get("image"), str) and image:
-                record["image"] = str(path.parent / image)
+                folders = (path.parent, scene or Path("/"))  # without a scene, nothing is opened
+                record["image"] = str(file_inside(folders, image, where="image", path=path))
     return content
 
 
 def _by_mesh(parts: Any, path: Path) -> dict[str, Any]:
     """Returns the descriptions of parts by the file names of their meshes."""
     if not isinstance(parts, list):
-        raise SceneError(f"{path}: parts is {parts!r}, not a list. Correct it, or remove it.")
+        raise SceneError(
+            f"{path}: parts is a {type(parts).__name__}, not a list. Correct it, or remove it."
+        )
     found: dict[str, Any] = {}
     for number, part in enumerate(parts):
         mesh = part.get("mesh") if isinstance(part, dict) else None
@@ -303,10 +306,10 @@ def _record(value: Any) -> Any:
 # Limits of indices of refraction and of light, whose powers single precision still holds.
 _LEAST, _MOST, _BRIGHTEST = 1e-3, 1e3, 1e9
 
-_positive = number_within(1.2e-38, math.inf, "a positive number")
+_size = number_within(1e-6, FARTHEST, "a positive number of world units")
 _index = number_within(_LEAST, _MOST, "a positive number, such as 1.5 for glass")
 _indices = vector_within(_LEAST, _MOST, "a positive number, or three for red, green and blue")
-_vector = vector_within(-math.inf, math.inf, "three numbers")
+_vector = vector_within(-FARTHEST, FARTHEST, "three numbers")
 _tint = vector_within(0.0, 1.0, "three numbers from 0 to 1, since no surface adds light")
 _absorption = vector_within(0.0, math.inf, "three numbers that are 0 or positive, per world unit")
 _light = vector_within(0.0, _BRIGHTEST, "vertex_colours, or three numbers that are 0 or positive")
@@ -316,7 +319,7 @@ _Checks = Mapping[str, Callable[[Any], Any]]
 _TOP: _Checks = {
     "version": number_within(1.0, 1.0, f"{VERSION}, the version that this library reads"),
     "rule": one_of(*get_args(RuleName)),
-    "ambient_index": _positive,
+    "ambient_index": _index,
     "ior": _record,
     "background": _record,
     "parts": _record,
@@ -325,8 +328,8 @@ _TOP: _Checks = {
 
 _BACKGROUND: _Checks = {
     "type": one_of(*get_args(BackgroundKind)),
-    "half_extent": _positive,
-    "radius": _positive,
+    "half_extent": _size,
+    "radius": _size,
     "centre": _vector,
     "image": of_type(str, "the name of a file"),
     "faces": _record,
@@ -472,14 +475,14 @@ def _object(record: Any, keys: tuple[str, ...], sources: Sequence[_Source]) -> d
 def _refusal(
     keys: tuple[str, ...], value: Any, sources: Sequence[_Source], wanted: str
 ) -> SceneError:
-    return _error(keys, sources, f"is {value!r}. Give {wanted}.")
+    return _error(keys, sources, f"is {configuration.abridged(value)}. Give {wanted}.")
 
 
 def _error(keys: tuple[str, ...], sources: Sequence[_Source], complaint: str) -> SceneError:
-    named = keys[:1] + tuple(
-        f"[{key!r}]" if above in ("parts", "faces") else f".{key}"
+    named = [keys[0][:99]] + [
+        f"[{key[:99]!r}]" if above in ("parts", "faces") else f".{key[:99]}"
         for above, key in itertools.pairwise(keys)
-    )
+    ]
     return SceneError(f"{_origin(keys, sources)}: {''.join(named)} {complaint}")
 
 

@@ -2,14 +2,21 @@
 
     {run}/model.json            static description (`SavedModel`)
     {run}/geometry.npz          surfaces and interfaces
-    {run}/checkpoints/{step}/   parameters, and next to them the training state
+    {run}/checkpoints/{step}/   parameters, and next to them the training state and `checksums.json`
 
 These files alone suffice to render a model, without the scene that it was trained on.
+
+Orbax notices missing and shorter files, but not a changed byte in an array, so a checkpoint is
+compared with the checksums of its files before it is read. One without them is of an earlier
+version, or its writer was killed when it was complete.
 """
 
 import dataclasses
+import json
 import os
-import zipfile
+import zlib
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
-from refref_jax import configuration
+from refref_jax import atomic_files, configuration
 from refref_jax.fields import registry
 from refref_jax.geometry.bvh import BVH
 from refref_jax.geometry.surfaces import Surfaces
@@ -37,6 +44,12 @@ _MODEL = "model.json"
 _GEOMETRY = "geometry.npz"
 
 CHECKPOINTS = "checkpoints"
+
+_CHECKSUMS = "checksums.json"
+
+_PIECE = 1 << 24
+
+_LONGEST_REASON = 200
 
 PARAMS_ITEM = "params"
 TRAINING_ITEM = "training"
@@ -159,6 +172,12 @@ def restore(manager: ocp.CheckpointManager, step: int, items: dict[str, Any]) ->
     Raises:
       ValueError: if the checkpoint is damaged.
     """
+    folder = Path(manager.directory) / str(step)
+    if damaged := _find_damage(folder, items):
+        raise ValueError(
+            f"The checkpoint {folder} is damaged: {damaged} is not as it was written. Remove that "
+            "folder to use an older one, or train again."
+        )
     here = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
     items = jax.tree.map(
         lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding or here), items
@@ -171,9 +190,47 @@ def restore(manager: ocp.CheckpointManager, step: int, items: dict[str, Any]) ->
             return ocp.args.Composite(**_replace_each(dict(former), _FormerParams, Params))
         except Exception:
             raise ValueError(
-                f"The checkpoint {manager.directory / str(step)} cannot be read ({_brief(error)}). "
-                "Remove it to use an older one, or train again."
+                f"The checkpoint {folder} cannot be read ({_brief(error)}). Remove it to use an "
+                "older one, or train again."
             ) from error
+
+
+def write_checksums(run: Path, step: int) -> None:
+    """Records the checksum of every file of a complete checkpoint."""
+    folder = run / CHECKPOINTS / str(step)
+    files = [path for path in sorted(folder.rglob("*")) if path.is_file()]
+    with ThreadPoolExecutor() as pool:
+        sums = list(pool.map(checksum, files))
+    names = (path.relative_to(folder).as_posix() for path in files)
+    with atomic_files.written_file(folder / _CHECKSUMS) as draft:
+        draft.write_text(json.dumps(dict(zip(names, sums, strict=True)), indent=1) + "\n")
+
+
+def _find_damage(folder: Path, items: Iterable[str]) -> str | None:
+    """Returns a file of some items of a checkpoint that was changed after it was written."""
+    try:
+        known = configuration.parse_json((folder / _CHECKSUMS).read_text(encoding="utf-8"))
+        names = [name for name in known if name.partition("/")[0] in items]
+    except FileNotFoundError:
+        return None
+    except (ValueError, AttributeError, TypeError):
+        return _CHECKSUMS
+    with ThreadPoolExecutor() as pool:
+        sums = pool.map(checksum, [folder / name for name in names])
+        changed = (name for name, found in zip(names, sums, strict=True) if found != known[name])
+        return next(changed, None)
+
+
+def checksum(path: Path) -> int | None:
+    """Returns the CRC-32 of a file; `None` if it cannot be read."""
+    found = 0
+    try:
+        with path.open("rb") as file:
+            while piece := file.read(_PIECE):
+                found = zlib.crc32(piece, found)
+    except OSError:
+        return None
+    return found
 
 
 class _FormerParams(NamedTuple):
@@ -206,12 +263,12 @@ def load_scene(run: Path) -> Scene:
     """
     path = run / _GEOMETRY
     try:
-        with np.load(path) as arrays:
-            bvh = BVH(*(arrays[name] for name in BVH._fields))
-            known: Any = _empty_arrays(arrays["index_inside"].size) | dict(arrays)
-            surfaces = Surfaces(bvh, *(known[name] for name in Surfaces._fields[1:]))
-            interfaces = Interfaces(*(known[name] for name in Interfaces._fields))
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        arrays: dict[str, Any] = atomic_files.read_arrays(path)
+        bvh = BVH(*(arrays[name] for name in BVH._fields))
+        known = _empty_arrays(arrays["index_inside"].size) | arrays
+        surfaces = Surfaces(bvh, *(known[name] for name in Surfaces._fields[1:]))
+        interfaces = Interfaces(*(known[name] for name in Interfaces._fields))
+    except (OSError, KeyError, ValueError) as error:
         raise ValueError(
             f"{path} cannot be read ({_brief(error)}). Restore it, or train again into another "
             "folder."
@@ -233,4 +290,4 @@ def _empty_arrays(parts: int) -> dict[str, np.ndarray]:
 
 def _brief(error: Exception) -> str:
     """Returns the kind of an error and the first line of its message."""
-    return f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"
+    return f"{type(error).__name__}: {str(error).partition(chr(10))[0][:_LONGEST_REASON]}"

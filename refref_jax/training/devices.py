@@ -5,6 +5,8 @@ an equal share of the light paths of every batch; the sums over paths, and their
 summed over the devices. Without a mesh there is one device, and no such sum.
 """
 
+import contextlib
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -45,6 +47,40 @@ def connect(*, coordinator: str, processes: int, process: int) -> None:
             f"{_PATIENCE} s ({str(error).splitlines()[0]}). Start all of them, each with its own "
             "process number, and check that the first one's host and port can be reached."
         ) from error
+
+
+def free_memory() -> int | None:
+    """Returns the bytes of memory that the first device has left; `None` if that is unknown.
+
+    On a CPU, the limits of the process and of its control group (Linux) count, too.
+    """
+    stats = jax.local_devices()[0].memory_stats()
+    if stats is not None:
+        return int(stats.get("bytes_limit", 0)) - int(stats.get("bytes_in_use", 0)) or None
+    system, own = _read_sizes("/proc/meminfo"), _read_sizes("/proc/self/status")
+    if "MemAvailable" not in system or "VmData" not in own:
+        return None
+    found = [system["MemAvailable"] + system.get("SwapFree", 0)]
+    with contextlib.suppress(OSError, ValueError):
+        limit = int(Path("/sys/fs/cgroup/memory.max").read_text())
+        found.append(limit - own.get("RssAnon", 0))
+    with contextlib.suppress(ImportError):
+        import resource
+
+        for kind, used in ((resource.RLIMIT_DATA, "VmData"), (resource.RLIMIT_AS, "VmSize")):
+            limit = resource.getrlimit(kind)[0]
+            if limit != resource.RLIM_INFINITY:
+                found.append(limit - own[used])
+    return max(0, min(found))
+
+
+def _read_sizes(path: str) -> dict[str, int]:
+    """Returns the sizes in bytes of a file of the kernel, which states them in KiB."""
+    try:
+        rows = [line.split() for line in Path(path).read_text().splitlines()]
+    except OSError:
+        return {}
+    return {row[0].rstrip(":"): 1024 * int(row[1]) for row in rows if row[-1:] == ["kB"]}
 
 
 def is_first() -> bool:

@@ -274,6 +274,8 @@ def train(
                 f"{jax.process_count()}. Run it in one."
             )
         folder = scene_source.open_scene(scene or config.scene.path)
+        if devices.is_first():
+            run_folder.check_images(run, scene_folder.read_frames(folder, "train"))
         objects, log = checkpoint_io.load_scene(run), _Log(periods, progress, stop)
         if model.config.splats is not None:
             step = _train_splats(run, config, model.config, folder, checkpoints, log, mesh)

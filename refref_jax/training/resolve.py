@@ -148,7 +148,7 @@ def read_facts(scene: SceneConfig, *, parts: Sequence[MeshPart] | None = None) -
     if rule == "priority" or (rule == "facing" and tree.overlaps) or embedded:
         mesh_checks.refuse_cameras_inside(parts, cameras)
     measure = functools.partial(scene_analysis.size_in_images, folder, parts)
-    bounds = background_fit.find_bounds(folder, told, **given, measure=measure)
+    bounds = background_fit.find_bounds(folder, told, **given, measure=measure, cameras=cameras)
     return SceneFacts(
         scene_analysis.analyse(parts, tree, cameras, rule=rule, space=bounds.space),
         cameras,
@@ -181,7 +181,7 @@ def resolve(config: TrainConfig, facts: SceneFacts) -> Resolved:
     presets.check_splats(config)
     asked, found, reasons = config, facts.analysis, _first_reasons(config)
     config = _decide(config, reasons, facts.origins.get("rule", _USUAL), rule=facts.rule)
-    settings, config = _resolve_paths(config, found, reasons)
+    settings, config = _resolve_paths(config, facts, reasons)
     config = _resolve_inside(config, found, settings, reasons)
     model, config = _resolve_model(config, facts, reasons)
     if settings.max_bends:
@@ -225,22 +225,23 @@ def _decide(
 
 
 def _resolve_paths(
-    config: TrainConfig, found: SceneAnalysis, reasons: dict[str, str]
+    config: TrainConfig, facts: SceneFacts, reasons: dict[str, str]
 ) -> tuple[PathSettings, TrainConfig]:
-    bends = config.model.field == learned_surface.KIND
+    found, bends = facts.analysis, config.model.field == learned_surface.KIND
     if found.parts == 0 and not bends and config.paths.name not in (None, "straight"):
         raise ValueError(
             f"There are no meshes that could bend light for paths={config.paths.name}."
             " Add .ply files of the objects to the scene's folder meshes, or use paths=straight."
         )
+    if config.paths.name is None:
+        meshes.refuse_missing(facts.parts, facts.origins)
     name, why = presets.usual_paths(config.model.field, found.parts)
     config = _decide(config, reasons, why, paths=name)
     if bends:
         config = _decide(config, reasons, why, max_bends=learned_surface.BENDS)
     paths = config.paths
-    settings = make_path_settings(
-        require(paths.name), min_throughput=paths.min_throughput, max_bends=paths.max_bends
-    )
+    limits: Any = {"min_throughput": paths.min_throughput, "max_bends": paths.max_bends}
+    settings = make_path_settings(require(paths.name), **limits)
     if settings.max_bends:
         why = "light may meet the objects again"
         if found.reentry == "impossible" and not bends:

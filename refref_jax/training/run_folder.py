@@ -6,11 +6,16 @@
     {run}/checkpoints/     the newest few states, saved atomically by Orbax
     {run}/gains.json       gain of each training image, RGB, if exposure=per_image
     {run}/coverage.npz     how many pixels see each vertex of a backdrop
+    {run}/images.json      checksums of the training images and cameras
 
 All but checkpoints and coverage are readable text.
 """
 
+import errno
 import json
+import math
+import shutil
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -22,6 +27,7 @@ import orbax.checkpoint as ocp
 from jaxtyping import Float
 
 from refref_jax import atomic_files, configuration
+from refref_jax.data.scene_folder import Frames
 from refref_jax.optics.media import Scene
 from refref_jax.render import checkpoint_io
 from refref_jax.render.checkpoint_io import (
@@ -40,7 +46,11 @@ from refref_jax.training.loop import TrainState
 _METRICS = "metrics.jsonl"
 _COVERAGE = "coverage.npz"
 _GAINS = "gains.json"
-_LEFT_BEHIND = (_METRICS, _COVERAGE, _GAINS, checkpoint_io.CHECKPOINTS)
+# Room for the files of a checkpoint that describe its arrays, in bytes.
+_OTHER_FILES = 1 << 20
+
+_IMAGES = "images.json"
+_LEFT_BEHIND = (_METRICS, _COVERAGE, _GAINS, _IMAGES, checkpoint_io.CHECKPOINTS)
 
 
 class Checkpoints:
@@ -66,6 +76,7 @@ class Checkpoints:
 
         Raises:
           ValueError: if a parameter is not finite. Existing checkpoints are kept.
+          OSError: if the disk has no room for it. Existing checkpoints are kept.
         """
         step = int(state.step)
         if step == self.newest():
@@ -79,8 +90,11 @@ class Checkpoints:
             PARAMS_ITEM: ocp.args.StandardSave(state.params),
             TRAINING_ITEM: ocp.args.StandardSave(_training_item(state)),
         }
+        _check_space(self._run, state)
         self._manager.save(step, args=ocp.args.Composite(**items), force=True)
         self._manager.wait_until_finished()
+        if jax.process_index() == 0:
+            checkpoint_io.write_checksums(self._run, step)
 
     def restore(self, like: TrainState) -> TrainState:
         """Reads the newest state.
@@ -101,6 +115,18 @@ class Checkpoints:
         )
         training = items[TRAINING_ITEM]
         return TrainState(training["step"], items[PARAMS_ITEM], training["optimizer"])
+
+
+def _check_space(run: Path, state: TrainState) -> None:
+    """Refuses to write a state without room for it: Orbax would leave a part, and print pages."""
+    needed = sum(leaf.nbytes for leaf in jax.tree.leaves(state)) + _OTHER_FILES
+    free = shutil.disk_usage(run).free
+    if free < needed:
+        raise OSError(
+            errno.ENOSPC,
+            f"a checkpoint takes up to {needed / 2**20:.0f} MiB, {free / 2**20:.0f} are free",
+            str(run),
+        )
 
 
 def _abstract(leaf: jax.Array | jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
@@ -237,6 +263,40 @@ def check_unchanged(run: Path, config: TrainConfig, model: SavedModel, scene: Sc
         )
 
 
+def check_images(run: Path, frames: Frames) -> None:
+    """Compares the training images with those at the start of the run, when they are recorded.
+
+    Args:
+      run: folder of the run.
+      frames: training images, with their masks, if any; they may have moved.
+
+    Raises:
+      ValueError: if an image, a mask or a camera has changed.
+    """
+    files = dict(zip(frames.names, frames.images, strict=True))
+    masks = zip(frames.names, frames.masks or (), strict=frames.masks is not None)
+    files |= {f"mask of {name}": path for name, path in masks}
+    found = {name: checkpoint_io.checksum(path) for name, path in files.items()}
+    cameras = np.asarray([*frames.cameras.poses.ravel(), frames.cameras.focal], np.float64)
+    found["cameras"] = zlib.crc32(cameras.tobytes())
+    path = run / _IMAGES
+    if not path.is_file():
+        with atomic_files.written_file(path) as draft:
+            draft.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+        return
+    try:
+        known = configuration.parse_json(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged ({error}). Remove it to trust the images.") from error
+    if known != found:
+        names = [name for name in found if name not in known or known[name] != found[name]]
+        raise ValueError(
+            f"{', '.join(names[:3]) or 'The number'} of the training images in "
+            f"{frames.images[0].parent} changed since {run} began. Restore the scene, train in "
+            f"another folder, or remove {path} to continue with the new ones."
+        )
+
+
 def write_coverage(run: Path, coverage: Float[np.ndarray, "6 side side"]) -> None:
     """Writes how many pixels see each vertex of a backdrop (`backdrop_solver.coverage`)."""
     with atomic_files.written_file(run / _COVERAGE) as draft, draft.open("wb") as file:
@@ -255,8 +315,12 @@ def read_coverage(run: Path) -> Float[np.ndarray, "6 side side"]:
             f"{path} does not exist: the run is of an earlier version, or has no backdrop. Train "
             "it again in another folder."
         )
-    with np.load(path) as file:
-        return np.asarray(file["coverage"])
+    try:
+        return atomic_files.read_arrays(path)["coverage"]
+    except (OSError, KeyError, ValueError) as error:
+        raise ValueError(
+            f"{path} cannot be read ({error}). Restore it, or train again in another folder."
+        ) from error
 
 
 def write_gains(run: Path, names: Sequence[str], gains: Float[np.ndarray, "views 3"]) -> None:
@@ -296,15 +360,25 @@ def read_metrics(run: Path) -> list[dict[str, Any]]:
     path = run / _METRICS
     if not path.is_file():
         return []
-    texts = path.read_text(encoding="utf-8").splitlines()
+    texts = path.read_text(encoding="utf-8", errors="replace").splitlines()
     lines = []
     for number, text in enumerate(texts, 1):
         try:
-            lines.append(configuration.parse_json(text))
+            lines.append(_line_of(text))
         except ValueError as error:
             if number == len(texts):
                 break
             raise ValueError(
-                f"Line {number} of {path} is not JSON ({error}). Remove that line."
+                f"Line {number} of {path} is not one of metrics ({error}). Remove that line."
             ) from error
     return lines
+
+
+def _line_of(text: str) -> dict[str, Any]:
+    line = configuration.parse_json(text)
+    if not isinstance(line, dict) or not {"step", "seconds"} <= set(line):
+        raise ValueError("it has no step or no seconds")
+    for name in ("step", "seconds"):
+        if math.isnan(configuration.as_number(line[name])):
+            raise ValueError(f"{name} is {configuration.abridged(line[name])}")
+    return line

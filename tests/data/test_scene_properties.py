@@ -191,7 +191,7 @@ _WRONG = {
     "foreign key": ({"zzz": 1}, "zzz is not a known key. The keys are version, rule, "),
     "newer version": ({"version": 2}, "version is 2. Give 1, the version that this library reads."),
     "rule": ({"rule": "nestd"}, "rule is 'nestd'. Give one of nested, facing, priority: nested?"),
-    "ambient": ({"ambient_index": 0}, "ambient_index is 0. Give a positive number."),
+    "ambient": ({"ambient_index": 0}, "ambient_index is 0. Give a positive number, such as "),
     "material": ({"ior": {"glass": "1.5"}}, "ior.glass is '1.5'. Give a positive number"),
     "materials": ({"ior": 1.5}, "ior is 1.5. Give an object"),
     "type": (_background(type="box"), "background.type is 'box'. Give one of cube, sphere, env."),

@@ -9,10 +9,11 @@ import jax
 import numpy as np
 import pytest
 
-from refref_jax.data import meshes
+from refref_jax.data import meshes, scene_folder
 from refref_jax.render import checkpoint_io
 from refref_jax.training import fit, run_folder
 from refref_jax.training.config import TrainConfig
+from tests.factories import small_scenes
 from tests.processes.command import ROOT
 
 pytestmark = [pytest.mark.loose, pytest.mark.longest]
@@ -137,3 +138,24 @@ def test_fit_takes_objects_in_place_of_the_meshes_and_stops_when_it_is_asked_to(
     assert model.scene.interfaces.index_inside.tolist() == [1.25]
     assert 0 < checkpoint_io.latest_step(tmp_path / "run") < 30
     assert lines[-1].startswith("Stopped at step ")
+
+
+def test_images_that_change_under_a_run_are_named(tmp_path):
+    scene = small_scenes.write_scene(tmp_path / "scene")
+    frames = scene_folder.read_frames(scene, "train")
+    run_folder.check_images(tmp_path, frames)
+    run_folder.check_images(tmp_path, frames)
+    moved = scene_folder.read_frames(shutil.copytree(scene, tmp_path / "moved"), "train")
+    run_folder.check_images(tmp_path, moved)
+    shutil.copy(frames.images[1], moved.images[0])
+    with pytest.raises(ValueError, match=r"r_000 of the training images in .*moved/train changed"):
+        run_folder.check_images(tmp_path, moved)
+    turned = frames._replace(cameras=frames.cameras._replace(focal=9.0))
+    with pytest.raises(ValueError, match=r"cameras of the training images"):
+        run_folder.check_images(tmp_path, turned)
+    fewer = frames._replace(names=("r_000",), images=frames.images[:1], masks=None)
+    with pytest.raises(ValueError, match="to continue with the new ones"):
+        run_folder.check_images(tmp_path, fewer)
+    (tmp_path / "images.json").write_text("{")
+    with pytest.raises(ValueError, match=r"images\.json is damaged"):
+        run_folder.check_images(tmp_path, frames)

@@ -383,7 +383,16 @@ def test_a_damaged_checkpoint_is_named(tmp_path):
     state, _ = next(loop.run_steps(_setup(), _start(), 1))
     with Checkpoints(tmp_path, keep=1) as checkpoints:
         checkpoints.save(state)
-    shutil.rmtree(tmp_path / "checkpoints" / "1" / "params")
+    folder = tmp_path / "checkpoints" / "1"
+    largest = max((folder / "params").rglob("*"), key=lambda path: path.stat().st_size)
+    content = largest.read_bytes()
+    middle = len(content) // 2
+    largest.write_bytes(content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :])
+    with pytest.raises(ValueError, match=rf"checkpoints/1 is damaged: params/.*{largest.name}"):
+        load_model(tmp_path)
+    (folder / "checksums.json").unlink()  # as earlier versions wrote it
+    load_model(tmp_path)
+    shutil.rmtree(folder / "params")
     with pytest.raises(ValueError, match=r"checkpoints/1 cannot be read"):
         load_model(tmp_path)
 
@@ -427,3 +436,11 @@ def test_a_damaged_line_of_metrics_is_named_and_nothing_is_lost(tmp_path):
 def test_the_loop_can_stop_in_the_middle_of_a_pool():
     taken = list(itertools.islice(loop.run_steps(_setup(), _start(), 12), 5))
     assert int(taken[-1][0].step) == 5
+
+
+def test_steps_that_cannot_fit_into_memory_are_refused_with_the_batch_that_could(monkeypatch):
+    monkeypatch.setattr(loop.devices, "free_memory", lambda: 1 << 10)
+    with pytest.raises(ValueError, match=r"batch=\d+ rays takes at least .* Lower batch to \d+ or"):
+        _setup()
+    monkeypatch.setattr(loop.devices, "free_memory", lambda: None)
+    assert _setup().capacity > 0

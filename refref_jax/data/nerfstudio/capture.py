@@ -22,12 +22,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import imageio.v3 as iio
 import numpy as np
 from jaxtyping import Bool, Float
 
+from refref_jax import configuration
 from refref_jax.choices import SPLITS
-from refref_jax.data import SceneError, image_files, scene_folder
+from refref_jax.data import SceneError, file_inside, image_files, scene_folder
 from refref_jax.geometry.cameras import Cameras, focal_length
 
 MODEL = "OPENCV"
@@ -98,11 +98,12 @@ def read_frame(content: dict[str, Any], record: Any, path: Path) -> CaptureFrame
     """
     name = scene_folder.get_text(record, "file_path", path)
     # Instant NGP omits the extension.
-    image = path.parent / (name if Path(name).suffix else f"{name}.png")
+    named = name if Path(name).suffix else f"{name}.png"
+    image = file_inside([path.parent], named, where="file_path", path=path)
     matrix = scene_folder.get(record, "transform_matrix", path)
     mask = None
     if "mask_path" in record:
-        mask = path.parent / scene_folder.get_text(record, "mask_path", path)
+        mask = file_inside([path.parent], record["mask_path"], where="mask_path", path=path)
     _check_model(content, record, name, path)
     for file in (image, mask):
         if file is not None and not file.is_file():
@@ -126,9 +127,9 @@ def read_number(records: Sequence[dict[str, Any]], name: str, path: Path) -> flo
     """
     values = [record[name] for record in records if name in record]
     for value in values:
-        is_number = isinstance(value, int | float) and not isinstance(value, bool)
-        if not is_number or not math.isfinite(value):
-            raise SceneError(f"{name} is {value!r} in {path}. Give a finite number.")
+        if not math.isfinite(configuration.as_number(value)):
+            shown = configuration.abridged(value)
+            raise SceneError(f"{name} is {shown} in {path}. Give a finite number.")
     if len(set(values)) > 1:
         raise SceneError(
             f"{name} is {values[0]} for all frames of {path}, and {values[1]} in one of them. "
@@ -159,7 +160,7 @@ def _intrinsics(
         key: read_number((content, record), key, path)
         for key in ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y")
     }
-    width, height = _image_size(image)
+    height, width = image_files.read_size(image)
     declared = (given["w"] or width, given["h"] or height)
     if declared != (width, height):
         raise SceneError(
@@ -193,16 +194,6 @@ def _focal(
         f"The {wrong} for {image.name} in {path}. Give a positive fl_x and fl_y in pixels, or "
         "angles in radians between 0 and pi."
     )
-
-
-def _image_size(path: Path) -> tuple[int, int]:
-    try:
-        height, width = iio.improps(path, plugin="pillow").shape[:2]
-    except Exception as error:  # Pillow raises OSError, SyntaxError and its own
-        raise SceneError(
-            f"{path} cannot be read as an image ({error}). Copy or convert it again."
-        ) from error
-    return width, height
 
 
 class Capture(NamedTuple):

@@ -347,7 +347,8 @@ def test_commands_take_scenes_of_hugging_face(ball, tmp_path, monkeypatch):
     shutil.rmtree(tmp_path / "cache")
     shutil.rmtree(tmp_path / "copy" / "mesh_files")
     shutil.rmtree(tmp_path / "copy" / "scene_files" / _NAME / "meshes")
-    options = (f"--out={tmp_path / 'run'}", "--batch=99999999")  # refused once the scene is read
+    # Refused once the scene is read.
+    options = (f"--out={tmp_path / 'run'}", "--paths=straight", "--batch=99999999")
     refused = run_command("train", f"--scene={source}", *options, fails=True)
     assert f"unpack {_NAME} {_IMAGES}/{_IMAGES}" in refused.stdout
     assert "warning: cube_smcvx_ball has no meshes" in refused.stdout
