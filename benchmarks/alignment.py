@@ -58,14 +58,14 @@ def main(arguments: list[str]) -> None:
     out.mkdir(parents=True, exist_ok=True)
     found = [row for folder in map(Path, _SCENES.value) for row in measure(folder, out)]
     with (out / "alignment.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\\n")
+        writer = csv.writer(file, lineterminator="\n")
         writer.writerow(Placed._fields)
         writer.writerows([*row[:2], *(f"{value:.4f}" for value in row[2:])] for row in found)
     print("| scene | placed by | axis, deg | rotation, deg | size, % | place, % | error, sRGB |")
     print("|---|---|---|---|---|---|---|")
     for row in found:
         print(f"| {' | '.join([*row[:2], *(f'{value:.4f}' for value in row[2:])])} |")
-    print(f"\\nMeasures: {out / 'alignment.csv'}")
+    print(f"\nMeasures: {out / 'alignment.csv'}")
     check(found)
 
 

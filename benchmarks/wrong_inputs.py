@@ -12,11 +12,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from experiments.r3f.alignment import rotation
 from refref_jax.data import scene_folder
 from refref_jax.data.meshes import MeshPart
 from refref_jax.data.scene_assembly import shaded_mesh
 from refref_jax.data.scene_properties import SceneProperties
-from refref_jax.reconstruct.masks import rotation
 
 _WAVES, _WAVELENGTH = 16, 0.25
 

@@ -5,7 +5,7 @@
     {out}/light/*.ply            the aligned parts
     {out}/errors.png             pixels before and after
 
-Outlines of the masks come first (`reconstruct.masks.fit_placement`), then the light refracted
+Outlines of the masks come first (`fit_placement`), then the light refracted
 through the object, with all parts, indices and colours as they are given. Pixels that were not
 fitted judge each step, and the better placement is kept. Where the background is a field, outlines
 alone place the object.
@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import scipy.sparse
 from jaxtyping import Float
 
 from experiments.cli.progress import ProgressBar
@@ -31,16 +32,23 @@ from refref_jax.data.meshes import MeshPart
 from refref_jax.data.scene_assembly import shaded_mesh
 from refref_jax.geometry.triangle_meshes import Mesh, diameter, volume
 from refref_jax.optics.interface_rules import NO_PARENT, nested
-from refref_jax.reconstruct import gauss_newton, model_selection
-from refref_jax.reconstruct.gauss_newton import Fit, Steps
-from refref_jax.reconstruct.masks import Outlines, PlacedObject, fit_placement, rotation
+from refref_jax.optics.media import Interfaces
+from refref_jax.reconstruct import ReconstructionError, gauss_newton, model_selection
+from refref_jax.reconstruct.gauss_newton import Candidate, Fit, Steps
+from refref_jax.reconstruct.masks import Outlines
 from refref_jax.reconstruct.model_selection import Trial
 from refref_jax.reconstruct.photometry import Backdrop
+from refref_jax.reconstruct.shapes import LARGEST_STEP, LARGEST_TURN, Posed
 
 PLACEMENT, FIGURE = "placement.json", "errors.png"
 
 WRITES = (PLACEMENT, records.FILE, FIGURE, "background", light_stage.FOLDER, geometry_stage.FOLDER)
 """Names of what is written."""
+
+# Steps of the fit of a placement, and the change, relative to the scales of the unknowns, that ends
+# it; standard deviations of its prior: radians, shares of the diameter, logarithm of the size.
+_PLACEMENT_ROUNDS, _PLACED = 30, 1e-4
+_TURN, _SHIFT, _GROWTH = 0.2, 0.1, 0.2
 
 # Reach of the outlines in the rounds of the first fit, pixels.
 _REACHES = (20.0, 8.0, 3.0)
@@ -94,6 +102,138 @@ class Background(NamedTuple):
     centre: Position | None
 
 
+class PlacedObject:
+    """An object of known shape whose direction, place and size are unknown, for `gauss_newton`.
+
+    The unknowns are a rotation vector about the middle of the object, in radians; a shift in world
+    units; and the logarithm of its size. Indices, tints and absorptions are known.
+
+    Attributes:
+      meshes: surface of each part as it is given, the order of `interfaces`.
+      interfaces: interfaces of the parts.
+      centre: middle of the box around all parts, world units.
+    """
+
+    def __init__(self, meshes: Sequence[Mesh], interfaces: Interfaces) -> None:
+        """Takes the parts.
+
+        Raises:
+          ReconstructionError: if there are none.
+        """
+        if not meshes:
+            raise ReconstructionError("The object has no parts. Pass at least one closed mesh.")
+        self.meshes, self.interfaces = tuple(meshes), interfaces
+        vertices = np.concatenate([mesh.vertices for mesh in meshes])
+        self.centre = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
+        self._size = diameter(vertices)
+
+    def start(self) -> Float[np.ndarray, "7"]:
+        """Returns zeros: the object as it is given."""
+        return np.zeros(7)
+
+    def pose(self, x: Float[np.ndarray, "7"]) -> Candidate:
+        """Returns the placed object."""
+        nothing = scipy.sparse.csr_array((len(self.meshes), 7))
+        posed = [self._placed(mesh, x) for mesh in self.meshes]
+        return Candidate(posed, self.interfaces, nothing, nothing[:0])
+
+    def index_of(self, x: Float[np.ndarray, "7"]) -> float:
+        """Returns the index of the first part, which is known."""
+        del x
+        return float(self.interfaces.index_inside[0])
+
+    def placed(self, x: Float[np.ndarray, "7"]) -> tuple[Mesh, ...]:
+        """Returns the surfaces of the placed parts."""
+        posed = [self._placed(mesh, x) for mesh in self.meshes]
+        return tuple(Mesh(p.vertices, p.faces, p.normals[p.normal_ids]) for p in posed)
+
+    def prior(
+        self, x: Float[np.ndarray, "7"]
+    ) -> tuple[Float[np.ndarray, "7 7"], Float[np.ndarray, "7"]]:
+        """Returns a wide prior around the object as it is given.
+
+        It keeps what neither outlines nor light determine, such as the rotation of a ball.
+        """
+        deviations = np.repeat([_TURN, _SHIFT * self._size, _GROWTH], [3, 3, 1])
+        return np.diag(deviations**-2.0), x / deviations**2
+
+    def scales(self) -> Float[np.ndarray, "7"]:
+        """Returns 0.02 radians, 0.77 % of the diameter, and 1 % of the size."""
+        return np.repeat([LARGEST_TURN, LARGEST_STEP * self._size, 0.01], [3, 3, 1])
+
+    def _placed(self, mesh: Mesh, x: Float[np.ndarray, "7"]) -> Posed:
+        turn, tangent = rotation(x[:3])
+        arms = math.exp(x[6]) * (mesh.vertices - self.centre) @ turn.T
+        normals, ids = np.unique(mesh.normals.reshape(-1, 3), axis=0, return_inverse=True)
+        normals = normals @ turn.T
+        moves = np.broadcast_to(np.eye(3), (len(arms), 3, 3))
+        still = np.zeros((len(normals), 3, 4))
+        by_vertices = np.concatenate([-_crosses(arms) @ tangent, moves, arms[..., None]], axis=-1)
+        by_normals = np.concatenate([-_crosses(normals) @ tangent, still], axis=-1)
+        return Posed(
+            self.centre + x[3:6] + arms,
+            mesh.faces,
+            normals,
+            ids.reshape(-1, 3),
+            by_vertices.reshape(-1, 7),
+            by_normals.reshape(-1, 7),
+        )
+
+
+def rotation(
+    vector: Float[np.ndarray, "3"],
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"]]:
+    """Returns the rotation of a rotation vector, and its left Jacobian.
+
+    A change `dv` of the vector turns the rotated object by the further rotation vector `J dv`.
+
+    Source: Rodrigues' formula; Sola, Deray and Atchuthan, A micro Lie theory (2018), Eq 145.
+    """
+    angle = float(np.linalg.norm(vector))
+    cross = _crosses(vector)
+    if angle < 1e-6:
+        return np.eye(3) + cross, np.eye(3) + 0.5 * cross
+    sine, cosine = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2
+    turn = np.eye(3) + sine * cross + cosine * cross @ cross
+    return turn, np.eye(3) + cosine * cross + (1.0 - sine) / angle**2 * cross @ cross
+
+
+def _crosses(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
+    """Returns the matrices of the cross products with vectors."""
+    return np.swapaxes(np.cross(vectors[..., None, :], np.eye(3)), -1, -2)
+
+
+def fit_placement(
+    model: PlacedObject,
+    outlines: Outlines,
+    *,
+    outermost: Sequence[int] = (0,),
+    x: Float[np.ndarray, "7"] | None = None,
+) -> Float[np.ndarray, "7"]:
+    """Fits direction, place and size of an object to outlines alone.
+
+    What outlines do not determine, such as the direction of a ball, stays.
+
+    Args:
+      model: the object.
+      outlines: the outlines; those with a long reach first, if the object is far away.
+      outermost: numbers of the parts that no other part contains.
+      x: placement to begin with; the object as it is given by default.
+    """
+    x = model.start() if x is None else x
+    for _ in range(_PLACEMENT_ROUNDS):
+        parts = model.pose(x).parts
+        rows = outlines.of_surfaces([parts[number] for number in outermost])
+        weighted = rows.weights[:, None] * rows.derivatives
+        precision, gradient = model.prior(x)
+        matrix = weighted.T @ rows.derivatives + precision
+        change = -np.linalg.solve(matrix, weighted.T @ rows.errors + gradient)
+        x = x + change
+        if np.max(np.abs(change) / model.scales()) < _PLACED:
+            break
+    return x
+
+
 def align(
     scene: Path, parts: Sequence[MeshPart], out: Path, background: Background, *, seed: int
 ) -> PlacementFacts:
@@ -116,14 +256,14 @@ def align(
     seen = light_stage.read(scene, seed=seed)
     x = model.start()
     for reach in _REACHES:
-        outlines = Outlines(views, seed=seed, reach=reach)
+        outlines = Outlines(views, seed=seed, reach=reach, creased=True)
         x = fit_placement(model, outlines, outermost=outer, x=x)
     surface = index_stage.learn_backdrop(scene, out, seed=seed, **background._asdict())
     by_outlines = _as_fit(model, x, outlines, outer)
     if surface is None:
         facts = _facts(model, by_outlines, (None, None, None), seen)
     else:
-        outlines = Outlines(views, common=light_stage.WIDER, seed=seed)
+        outlines = Outlines(views, common=light_stage.WIDER, seed=seed, creased=True)
         found = _by_light(model, by_outlines, surface, seen, outlines, outer)
         before, after = found[0], min(found[1:], key=lambda trial: trial.error)
         facts = _facts(model, after.fit, tuple(trial.error for trial in found), seen)

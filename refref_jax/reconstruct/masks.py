@@ -19,8 +19,7 @@ about a third of a pixel. Masks that are wrong, or show something else, lose the
 
 `fit_profile` fits a body of revolution to outlines alone. A mesh from masks is up to half a pixel
 too narrow and has waves along its profile; the outlines of all views together determine it to some
-hundredths of a pixel, and its normals to half a degree. `fit_placement` moves, turns and scales an
-object of known shape until its outlines are those of the masks.
+hundredths of a pixel, and its normals to half a degree.
 
 Source: Cipolla and Blake, Surface Shape from the Deformation of Apparent Contours (1992), for the
 derivative; its use beside refraction is ours.
@@ -36,13 +35,12 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt, gaussian_filter, gaussian_laplace
 
 from refref_jax.geometry.cameras import Cameras, project
-from refref_jax.geometry.triangle_meshes import Mesh, diameter, unit_vectors
-from refref_jax.optics.media import Interfaces
+from refref_jax.geometry.triangle_meshes import unit_vectors
 from refref_jax.reconstruct import ReconstructionError
 from refref_jax.reconstruct.families import Revolution
 from refref_jax.reconstruct.gauss_newton import Candidate, Rows
 from refref_jax.reconstruct.relief import Relief
-from refref_jax.reconstruct.shapes import LARGEST_STEP, LARGEST_TURN, Posed
+from refref_jax.reconstruct.shapes import Posed
 
 BLUR = 1.5
 """Standard deviation of the average over an outline, pixels."""
@@ -161,10 +159,8 @@ _POINTS = 100
 # as a share of the diameter: neighbouring points have errors that are alike.
 _ROUNDS, _BEND = 5, 0.001
 
-# Steps of the fit of a placement, and the change, relative to the scales of the unknowns, that ends
-# it; standard deviations of its prior: radians, shares of the diameter, logarithm of the size.
-_PLACEMENT_ROUNDS, _PLACED = 30, 1e-4
-_TURN, _SHIFT, _GROWTH = 0.2, 0.1, 0.2
+# Cosine of the angle between normals at a crease, and points along it.
+_CREASE, _ALONG_CREASE = math.cos(math.radians(10.0)), 12
 
 # Largest error of a body with a relief, as a share of that of the body without it.
 _BETTER = 0.95
@@ -184,11 +180,29 @@ class _Rim(NamedTuple):
     share: Float[np.ndarray, " points"]
 
 
+class _Creases(NamedTuple):
+    """Edges across which the shading normals jump.
+
+    Attributes:
+      edges: their vertices.
+      faces: the faces on both sides.
+    """
+
+    edges: Int[np.ndarray, "creases 2"]
+    faces: Int[np.ndarray, "creases 2"]
+
+
 class Outlines:
     """The outlines of masks, as a function of a candidate to `Rows`."""
 
     def __init__(
-        self, views: Views, *, common: float = 0.0, seed: int = 0, reach: float = _FURTHEST
+        self,
+        views: Views,
+        *,
+        common: float = 0.0,
+        seed: int = 0,
+        reach: float = _FURTHEST,
+        creased: bool = False,
     ) -> None:
         """Measures the signed distances of all masks.
 
@@ -197,9 +211,10 @@ class Outlines:
           common: standard deviation, in pixels, of how much too wide all masks are.
           seed: seed of the draws of rim points.
           reach: distance from an outline beyond which points have no say, pixels.
+          creased: whether surfaces turn away at creases, too, as meshes that are given may.
         """
         self._cameras, self._common, self._seed = views.cameras, common, seed
-        self._reach = reach
+        self._reach, self._creased = reach, creased
         self._distances = [
             signed_distances(mask).astype(np.float32) if mask.any() and not mask.all() else None
             for mask in views.masks
@@ -212,10 +227,12 @@ class Outlines:
     def of_surface(self, part: Posed) -> Rows:
         """Returns the equations of the outline of a surface."""
         normals = _vertex_normals(part)
-        edges = _edges(part.faces)
+        edges, creases = _edges(part.faces), _creases(part) if self._creased else None
+        if creases is not None:  # the mean of normals on both sides of a crease says nothing
+            edges = edges[~np.any(np.isin(edges, creases.edges), axis=1)]
         generator = np.random.default_rng(self._seed)
         found = [
-            self._of_view(view, distances, part, normals, edges, generator)
+            self._of_view(view, distances, part, normals, edges, creases, generator)
             for view, distances in enumerate(self._distances)
             if distances is not None
         ]
@@ -242,11 +259,15 @@ class Outlines:
         part: Posed,
         normals: Float[np.ndarray, "vertices 3"],
         edges: Int[np.ndarray, "edges 2"],
+        creases: "_Creases | None",
         generator: np.random.Generator,
     ) -> tuple[Float[np.ndarray, " points"], scipy.sparse.csr_array]:
         """Returns errors and derivatives by the vertices of the rim of one view."""
         pose, columns = self._cameras.poses[view], 3 * len(part.vertices)
         rim = _rim(part.vertices, normals, edges, pose[:, 3])
+        if creases is not None:
+            along = _crease_rim(part, creases, pose[:, 3])
+            rim = _Rim(*(np.concatenate(both) for both in zip(rim, along, strict=True)))
         share = rim.share[:, None]
         points = (1.0 - share) * part.vertices[rim.first] + share * part.vertices[rim.second]
         seen = project(points, pose, self._cameras)
@@ -301,138 +322,6 @@ def _error(outer: Revolution, outlines: Outlines) -> float:
     return float(np.mean(np.minimum(np.abs(errors), _WRONG / _DEVIATION)))
 
 
-class PlacedObject:
-    """An object of known shape whose direction, place and size are unknown, for `gauss_newton`.
-
-    The unknowns are a rotation vector about the middle of the object, in radians; a shift in world
-    units; and the logarithm of its size. Indices, tints and absorptions are known.
-
-    Attributes:
-      meshes: surface of each part as it is given, the order of `interfaces`.
-      interfaces: interfaces of the parts.
-      centre: middle of the box around all parts, world units.
-    """
-
-    def __init__(self, meshes: Sequence[Mesh], interfaces: Interfaces) -> None:
-        """Takes the parts.
-
-        Raises:
-          ReconstructionError: if there are none.
-        """
-        if not meshes:
-            raise ReconstructionError("The object has no parts. Pass at least one closed mesh.")
-        self.meshes, self.interfaces = tuple(meshes), interfaces
-        vertices = np.concatenate([mesh.vertices for mesh in meshes])
-        self.centre = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
-        self._size = diameter(vertices)
-
-    def start(self) -> Float[np.ndarray, "7"]:
-        """Returns zeros: the object as it is given."""
-        return np.zeros(7)
-
-    def pose(self, x: Float[np.ndarray, "7"]) -> Candidate:
-        """Returns the placed object."""
-        nothing = scipy.sparse.csr_array((len(self.meshes), 7))
-        posed = [self._placed(mesh, x) for mesh in self.meshes]
-        return Candidate(posed, self.interfaces, nothing, nothing[:0])
-
-    def index_of(self, x: Float[np.ndarray, "7"]) -> float:
-        """Returns the index of the first part, which is known."""
-        del x
-        return float(self.interfaces.index_inside[0])
-
-    def placed(self, x: Float[np.ndarray, "7"]) -> tuple[Mesh, ...]:
-        """Returns the surfaces of the placed parts."""
-        posed = [self._placed(mesh, x) for mesh in self.meshes]
-        return tuple(Mesh(p.vertices, p.faces, p.normals[p.normal_ids]) for p in posed)
-
-    def prior(
-        self, x: Float[np.ndarray, "7"]
-    ) -> tuple[Float[np.ndarray, "7 7"], Float[np.ndarray, "7"]]:
-        """Returns a wide prior around the object as it is given.
-
-        It keeps what neither outlines nor light determine, such as the rotation of a ball.
-        """
-        deviations = np.repeat([_TURN, _SHIFT * self._size, _GROWTH], [3, 3, 1])
-        return np.diag(deviations**-2.0), x / deviations**2
-
-    def scales(self) -> Float[np.ndarray, "7"]:
-        """Returns 0.02 radians, 0.77 % of the diameter, and 1 % of the size."""
-        return np.repeat([LARGEST_TURN, LARGEST_STEP * self._size, 0.01], [3, 3, 1])
-
-    def _placed(self, mesh: Mesh, x: Float[np.ndarray, "7"]) -> Posed:
-        turn, tangent = rotation(x[:3])
-        arms = math.exp(x[6]) * (mesh.vertices - self.centre) @ turn.T
-        normals, ids = np.unique(mesh.normals.reshape(-1, 3), axis=0, return_inverse=True)
-        normals = normals @ turn.T
-        moves = np.broadcast_to(np.eye(3), (len(arms), 3, 3))
-        still = np.zeros((len(normals), 3, 4))
-        by_vertices = np.concatenate([-_crosses(arms) @ tangent, moves, arms[..., None]], axis=-1)
-        by_normals = np.concatenate([-_crosses(normals) @ tangent, still], axis=-1)
-        return Posed(
-            self.centre + x[3:6] + arms,
-            mesh.faces,
-            normals,
-            ids.reshape(-1, 3),
-            by_vertices.reshape(-1, 7),
-            by_normals.reshape(-1, 7),
-        )
-
-
-def rotation(
-    vector: Float[np.ndarray, "3"],
-) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"]]:
-    """Returns the rotation of a rotation vector, and its left Jacobian.
-
-    A change `dv` of the vector turns the rotated object by the further rotation vector `J dv`.
-
-    Source: Rodrigues' formula; Sola, Deray and Atchuthan, A micro Lie theory (2018), Eq 145.
-    """
-    angle = float(np.linalg.norm(vector))
-    cross = _crosses(vector)
-    if angle < 1e-6:
-        return np.eye(3) + cross, np.eye(3) + 0.5 * cross
-    sine, cosine = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2
-    turn = np.eye(3) + sine * cross + cosine * cross @ cross
-    return turn, np.eye(3) + cosine * cross + (1.0 - sine) / angle**2 * cross @ cross
-
-
-def _crosses(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
-    """Returns the matrices of the cross products with vectors."""
-    return np.swapaxes(np.cross(vectors[..., None, :], np.eye(3)), -1, -2)
-
-
-def fit_placement(
-    model: PlacedObject,
-    outlines: Outlines,
-    *,
-    outermost: Sequence[int] = (0,),
-    x: Float[np.ndarray, "7"] | None = None,
-) -> Float[np.ndarray, "7"]:
-    """Fits direction, place and size of an object to outlines alone.
-
-    What outlines do not determine, such as the direction of a ball, stays.
-
-    Args:
-      model: the object.
-      outlines: the outlines; those with a long reach first, if the object is far away.
-      outermost: numbers of the parts that no other part contains.
-      x: placement to begin with; the object as it is given by default.
-    """
-    x = model.start() if x is None else x
-    for _ in range(_PLACEMENT_ROUNDS):
-        parts = model.pose(x).parts
-        rows = outlines.of_surfaces([parts[number] for number in outermost])
-        weighted = rows.weights[:, None] * rows.derivatives
-        precision, gradient = model.prior(x)
-        matrix = weighted.T @ rows.derivatives + precision
-        change = -np.linalg.solve(matrix, weighted.T @ rows.errors + gradient)
-        x = x + change
-        if np.max(np.abs(change) / model.scales()) < _PLACED:
-            break
-    return x
-
-
 def _vertex_normals(part: Posed) -> Float[np.ndarray, "vertices 3"]:
     """Returns the mean of the corner normals at each vertex."""
     at, each = part.faces.ravel(), part.normals[part.normal_ids.ravel()]
@@ -444,6 +333,33 @@ def _edges(faces: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, "edges 2"]:
     """Returns each edge of a closed mesh once."""
     both = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     return both[both[:, 0] < both[:, 1]]
+
+
+def _creases(part: Posed) -> _Creases:
+    """Returns the edges of a closed mesh whose normals differ by more than 10 degrees."""
+    around = [0, 1, 1, 2, 2, 0]
+    both, ids = (x[:, around].reshape(-1, 2) for x in (part.faces, part.normal_ids))
+    turned = both[:, 0] > both[:, 1]
+    both[turned], ids[turned] = both[turned, ::-1], ids[turned, ::-1]
+    order = np.lexsort(both.T)
+    first, second = order[::2], order[1::2]
+    if not np.array_equal(both[first], both[second]):
+        raise ReconstructionError("A mesh is not closed, so its outlines are unknown. Close it.")
+    cosines = np.sum(part.normals[ids[first]] * part.normals[ids[second]], axis=-1)
+    sharp = np.any(cosines < _CREASE, axis=1)
+    return _Creases(both[first][sharp], np.stack([first, second], axis=-1)[sharp] // 3)
+
+
+def _crease_rim(part: Posed, creases: _Creases, camera: Float[np.ndarray, "3"]) -> _Rim:
+    """Returns points of the creases with one face towards the camera and one away from it."""
+    corners = part.vertices[part.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    front = np.sum(normals * (camera - corners[:, 0]), axis=-1) > 0.0
+    seen = creases.edges[front[creases.faces[:, 0]] != front[creases.faces[:, 1]]]
+    # The ends are left out, where the smoothed distances of a mask cut corners.
+    share = (np.arange(_ALONG_CREASE) + 1.5) / (_ALONG_CREASE + 2.0)
+    repeated = np.repeat(seen, _ALONG_CREASE, axis=0)
+    return _Rim(repeated[:, 0], repeated[:, 1], np.tile(share, len(seen)))
 
 
 def _rim(

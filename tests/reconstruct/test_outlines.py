@@ -4,19 +4,12 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_dilation
 
-from refref_jax.geometry.triangle_meshes import make_mesh
 from refref_jax.optics.interface_rules import NO_PARENT, nested
-from refref_jax.reconstruct import ReconstructionError, gauss_newton
+from refref_jax.reconstruct import gauss_newton
 from refref_jax.reconstruct import masks as outlines_module
 from refref_jax.reconstruct.families import Revolution, Sphere
 from refref_jax.reconstruct.gauss_newton import Candidate, Equations, Rows
-from refref_jax.reconstruct.masks import (
-    Outlines,
-    PlacedObject,
-    Views,
-    fit_placement,
-    fit_profile,
-)
+from refref_jax.reconstruct.masks import Outlines, Views, fit_profile
 from refref_jax.reconstruct.revolution import Axis, Profile
 from refref_jax.reconstruct.shape_from_refraction import SingleObject
 from refref_jax.reconstruct.shapes import FixedShape, FreeSurface
@@ -180,56 +173,3 @@ def test_a_profile_far_from_all_outlines_stays_as_it_is(outlines):
     small = Revolution(Axis(_ORIGIN, np.eye(3)), Profile(points, closed=False), 1.0)
     found = fit_profile(small, outlines)
     np.testing.assert_allclose(np.linalg.norm(found.points, axis=-1), 0.5, atol=1e-3)
-
-
-_PLACED = np.array([0.02, -0.03, 0.015, 0.02, 0.01, -0.03, np.log(1.03)])
-
-
-_RADII = np.array([0.6, 0.8, 1.1])
-
-
-def _ellipsoid(points):
-    """A distance that is never too long."""
-    return _RADII.min() * (np.linalg.norm(points / _RADII, axis=-1) - 1.0)
-
-
-def _ellipsoid_mesh():
-    ball = bodies.icosphere(4)
-    return make_mesh(_RADII * ball.vertices, ball.faces)
-
-
-def _placed(mesh):
-    return PlacedObject([mesh], nested([1.5], [NO_PARENT]))
-
-
-@pytest.mark.parametrize("size", [0.0, 1e-9, 1.0, 30.0], ids=str)
-def test_derivatives_of_a_placement_are_central_differences(size):
-    model, direction = _placed(bodies.icosphere(1)), np.linspace(-1.0, 1.5, 7)
-    x, step = size * _PLACED, 1e-6
-    part, *beside = (model.pose(x + t * direction).parts[0] for t in (0.0, step, -step))
-    for name in ("vertices", "normals"):
-        change = (getattr(beside[0], name) - getattr(beside[1], name)) / (2.0 * step)
-        slopes = getattr(part, f"by_{name}") @ direction
-        np.testing.assert_allclose(slopes.reshape(-1, 3), change, atol=1e-7 * max(1.0, size))
-    np.testing.assert_allclose(np.linalg.norm(part.normals, axis=1), 1.0, rtol=1e-9)
-    (placed,) = model.placed(x)
-    np.testing.assert_array_equal(placed.vertices, part.vertices)
-
-
-def test_outlines_place_an_object_that_lies_wrong():
-    cameras = bodies.cameras_around(12, size=160, distance=4.0)
-    views = Views(bodies.masks_of(_ellipsoid, cameras, steps=120), cameras)
-    (wrong,) = _placed(_ellipsoid_mesh()).placed(3.0 * _PLACED)
-    model, x = _placed(wrong), None
-    for reach in (20.0, 3.0):
-        x = fit_placement(model, Outlines(views, reach=reach), x=x)
-    (found,) = model.placed(x)
-    true = _ellipsoid_mesh().vertices
-    # 0.4 % of the length is a fifth of a pixel.
-    assert np.max(np.linalg.norm(found.vertices - true, axis=1)) < 0.004 * 2.2
-    assert np.max(np.linalg.norm(wrong.vertices - true, axis=1)) > 0.2
-
-
-def test_an_object_without_parts_is_refused():
-    with pytest.raises(ReconstructionError, match="no parts"):
-        PlacedObject([], nested([], []))

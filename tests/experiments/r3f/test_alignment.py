@@ -4,11 +4,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from experiments.r3f import alignment, chain, index_stage, records, training_body
-from experiments.r3f.alignment import Background
+from experiments.r3f.alignment import Background, PlacedObject, fit_placement
 from refref_jax.data import SceneError, meshes
 from refref_jax.geometry.triangle_meshes import make_mesh
+from refref_jax.optics.interface_rules import NO_PARENT, nested
+from refref_jax.reconstruct import ReconstructionError
+from refref_jax.reconstruct.masks import Outlines, Views
 from refref_jax.training.config import TrainConfig
 from tests.factories import bodies, scenes
 from tests.factories.silhouettes import RADIUS, write_scene
@@ -93,3 +97,80 @@ def test_other_meshes_than_the_scenes_are_read_by_their_names(tmp_path):
     meshes.write_mesh(other / "scan_diamond.ply", *bodies.icosphere(2))
     (part,) = meshes.read_meshes(scene, folder=other)
     assert (part.name, part.index) == ("scan_diamond", meshes.INDEX_OF_REFRACTION["diamond"])
+
+
+_PLACED = np.array([0.02, -0.03, 0.015, 0.02, 0.01, -0.03, np.log(1.03)])
+
+
+_RADII = np.array([0.6, 0.8, 1.1])
+
+
+def _ellipsoid(points):
+    """A distance that is never too long."""
+    return _RADII.min() * (np.linalg.norm(points / _RADII, axis=-1) - 1.0)
+
+
+def _ellipsoid_mesh():
+    ball = bodies.icosphere(4)
+    return make_mesh(_RADII * ball.vertices, ball.faces)
+
+
+def _placed(mesh):
+    return PlacedObject([mesh], nested([1.5], [NO_PARENT]))
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-9, 1.0, 30.0], ids=str)
+def test_derivatives_of_a_placement_are_central_differences(size):
+    model, direction = _placed(bodies.icosphere(1)), np.linspace(-1.0, 1.5, 7)
+    x, step = size * _PLACED, 1e-6
+    part, *beside = (model.pose(x + t * direction).parts[0] for t in (0.0, step, -step))
+    for name in ("vertices", "normals"):
+        change = (getattr(beside[0], name) - getattr(beside[1], name)) / (2.0 * step)
+        slopes = getattr(part, f"by_{name}") @ direction
+        np.testing.assert_allclose(slopes.reshape(-1, 3), change, atol=1e-7 * max(1.0, size))
+    np.testing.assert_allclose(np.linalg.norm(part.normals, axis=1), 1.0, rtol=1e-9)
+    (placed,) = model.placed(x)
+    np.testing.assert_array_equal(placed.vertices, part.vertices)
+
+
+def test_outlines_place_an_object_that_lies_wrong():
+    cameras = bodies.cameras_around(12, size=160, distance=4.0)
+    views = Views(bodies.masks_of(_ellipsoid, cameras, steps=120), cameras)
+    (wrong,) = _placed(_ellipsoid_mesh()).placed(3.0 * _PLACED)
+    model, x = _placed(wrong), None
+    for reach in (20.0, 3.0):
+        x = fit_placement(model, Outlines(views, reach=reach), x=x)
+    (found,) = model.placed(x)
+    true = _ellipsoid_mesh().vertices
+    # 0.4 % of the length is a fifth of a pixel.
+    assert np.max(np.linalg.norm(found.vertices - true, axis=1)) < 0.004 * 2.2
+    assert np.max(np.linalg.norm(wrong.vertices - true, axis=1)) > 0.2
+
+
+def test_an_object_without_parts_is_refused():
+    with pytest.raises(ReconstructionError, match="no parts"):
+        PlacedObject([], nested([], []))
+
+
+def test_creases_have_outlines_of_their_own():
+    """A box of twelve triangles has no other points where it turns away from a camera."""
+    cameras = bodies.cameras_around(12, size=160, distance=4.0)
+    half = np.array([0.5, 0.7, 0.9])
+    masks = bodies.masks_of(lambda points: bodies.box(points, half=half), cameras)
+    box = trimesh.creation.box(2.0 * half)
+    mesh = make_mesh(np.asarray(box.vertices), np.asarray(box.faces, np.int64))
+    (wrong,) = _placed(mesh).placed(_PLACED)
+    model, x = _placed(wrong), None
+    for reach in (20.0, 3.0):
+        x = fit_placement(model, Outlines(Views(masks, cameras), reach=reach, creased=True), x=x)
+    (found,) = model.placed(x)
+    assert np.max(np.linalg.norm(found.vertices - mesh.vertices, axis=1)) < 0.004 * 2.5
+
+
+def test_creases_of_an_open_mesh_are_refused():
+    box = trimesh.creation.box()
+    mesh = make_mesh(np.asarray(box.vertices), np.asarray(box.faces[:-1], np.int64))
+    cameras = bodies.cameras_around(2)
+    views = Views(bodies.masks_of(bodies.ball, cameras), cameras)
+    with pytest.raises(ReconstructionError, match="not closed"):
+        fit_placement(_placed(mesh), Outlines(views, creased=True))
