@@ -233,7 +233,7 @@ def _resolve_paths(
             f"There are no meshes that could bend light for paths={config.paths.name}."
             " Add .ply files of the objects to the scene's folder meshes, or use paths=straight."
         )
-    name, why = presets.usual_paths(config.model.field, found.parts)
+    name, why = presets.usual_paths(config, found.parts)
     config = _decide(config, reasons, why, paths=name)
     paths = config.paths
     settings = make_path_settings(
@@ -367,11 +367,12 @@ def _resolve_far_field(
 
 def _needs_of_a_field(config: TrainConfig, facts: SceneFacts) -> list[str]:
     """Returns what a backdrop cannot model, even with a field in front of it."""
+    field, bent = config.model.field, ("raydef", "raydef_polyline")
     needs = {
-        "Gaussian splats (field=splats)": config.model.field == presets.SPLATS,
+        "Gaussian splats (field=splats)": field == presets.SPLATS,
         "straight rays (paths=straight)": facts.analysis.parts > 0 and not config.paths.max_bends,
         "contraction=always": config.model.contraction == "always",
-        "a surface (field=neus or unisurf)": config.model.field in ("neus", "unisurf"),
+        f"a surface or deformation (field={field})": field in ("neus", "unisurf", *bent),
     }
     return [name for name, holds in needs.items() if holds]
 

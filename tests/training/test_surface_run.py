@@ -219,7 +219,7 @@ def test_commands_evaluate_and_export_the_surface(trained, tmp_path):
         ({"contraction": "always"}, r"contraction=always\)\. Use field=zipnerf"),
         (
             {"far_field": "backdrop", "paths": None},
-            r"cannot model a surface \(field=neus",
+            r"cannot model a surface or deformation \(field=neus",
         ),
         ({"eikonal_weight": -1.0}, r"weight or blur of the losses is -1\.0"),
         ({"field": "zipnerf", "eikonal_weight": 0.1}, r"eikonal_weight=0\.1 has no effect on"),
