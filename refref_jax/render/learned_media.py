@@ -191,8 +191,9 @@ def bend(
     """Bends a straight ray to a polyline through knots, which are moved.
 
     The knots are evenly spread in the normalised coordinate, and the last one is at the end of the
-    ray. In an unbounded scene, offsets grow with the distance from the centre. Knots stay within
-    the scene bounds, and the camera where it is.
+    ray. They move across it: along it, they could only turn back or bunch up. In an unbounded
+    scene, offsets grow with the distance from the centre. Knots stay within the scene bounds, and
+    the camera where it is.
 
     Args:
       params: parameters of the field.
@@ -214,7 +215,9 @@ def bend(
     if domain.space == "unbounded":
         centre = jnp.asarray(domain.centre, t.dtype)
         reach = jnp.maximum(reach, numerics.length(points.position - centre[None]))
-    knots = points.position[1:] + reach[1:, None] * offsets.position
+    ways = points.direction[1:]
+    across = offsets.position - numerics.dot(offsets.position, ways)[:, None] * ways
+    knots = points.position[1:] + reach[1:, None] * across
     knots = jax.vmap(lambda x: scene_bounds.nearest_within(domain, x))(knots)
     bent = polylines.through(line, knots)
     if domain.space == "unbounded":  # it ends at its last knot, as the straight ray does
