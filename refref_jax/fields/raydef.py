@@ -2,7 +2,7 @@
 
 A small network maps a point of a straight ray and the ray's direction to an offset of the point and
 of the direction; density and colour are those of Zip-NeRF's field (`fields/zipnerf.py`) at the
-moved point, seen along the turned direction. Point and direction fix the ray, so any path of light
+moved point, seen along the turned direction. Point and direction fix the ray, so any light path
 that depends on the ray alone is in reach. Lengths and distances are those of the straight ray.
 
 `raydef` moves every sample. `raydef_polyline`, which is ours, evaluates the network at a few knots
@@ -137,7 +137,7 @@ class RaydefParams(NamedTuple):
 
 
 def init_radiance(key: Array, config: DeformationConfig) -> RaydefParams:
-    """Returns initial parameters, of nearly straight light paths."""
+    """Returns initial parameters, of nearly straight rays."""
     field_key, deformation_key = jax.random.split(key)
     nowhere = jnp.zeros(3, jnp.float32)
     return RaydefParams(

@@ -142,7 +142,7 @@ def _advancing(path: LightPaths, line: Polyline, sampled: Bool[Array, " segments
 def through(line: Polyline, vertices: Float[Array, "segments 3"]) -> Polyline:
     """Returns the line from the start of a straight one through other points.
 
-    Its last segment goes on beyond the last of them. Footprints grow with arc length as along the
+    Its last segment continues beyond the last of them. Footprints grow with arc length as along the
     straight line. Where two vertices are equal, the segment between them has its direction.
 
     Args:

@@ -23,7 +23,7 @@ def _place():
 
 
 def _direction():
-    return jnp.array([0.36, 0.48, 0.8], jnp.float32)
+    return jnp.array([0.48, -0.6, 0.64], jnp.float32)
 
 
 def _trained(config=_CONFIG, scale=0.6):
