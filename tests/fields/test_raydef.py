@@ -89,14 +89,14 @@ def test_density_and_colour_are_those_of_zipnerf():
 
 
 def test_gradients_are_numerical():
-    """With a smooth stretch of the network: away from the kinks of its activation."""
+    """At a place without kinks of the network's activation nearby."""
     leaves, tree = jax.tree.flatten(_trained().deformation)
 
     def offsets(place, direction, *leaves):
         params = raydef.RaydefParams(None, jax.tree.unflatten(tree, leaves))
         return jnp.concatenate(raydef.deform(params, _CONFIG, place, direction, jnp.ones(())))
 
-    gradients.assert_numerical(offsets, _place(), _direction(), *leaves)
+    gradients.assert_numerical(offsets, _place(), [0.36, 0.48, 0.8], *leaves)
 
 
 @pytest.mark.parametrize("scale", [0.0, 1.0, 1e4])
