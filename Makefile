@@ -4,6 +4,7 @@
 # `python -m experiments.dataset.make` renders with, beside it. `make benchmark-small` needs both: it
 # renders eight scenes and compares three methods on them; docs/benchmark.md says how long that takes.
 # `make faults` kills and disturbs commands, and compares what they come to (docs/reliability.md).
+# `make paper-table` adds all rows of the paper's main table that there are, which takes hours.
 # `make notebooks` executes those of experiments/colab and stores them with what they print and draw.
 
 PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
@@ -27,8 +28,8 @@ PROCESSES = $(shell $(PYTHON) -c 'import os; print(min(5, 1 + (os.cpu_count() or
 PYTEST = $(RUN) pytest --numprocesses=$(PROCESSES) --dist=loadscope --no-loadscope-reorder
 DATASET_TESTS := tests/experiments/dataset
 
-.PHONY: demo test test-dataset test-slow lint format clean notebooks dataset-env benchmark-small
-.PHONY: faults
+.PHONY: demo test test-dataset test-slow lint format clean notebooks dataset-env benchmark-small \
+	faults paper-table
 
 demo: $(READY)
 	$(RUN) experiments.train --scene=experiments/data/cube_smcvx_ball --out=runs/demo --resume
@@ -68,6 +69,11 @@ benchmark-small: $(READY) $(BLENDER_READY)
 
 faults: $(READY)
 	$(RUN) benchmarks.faults
+
+paper-table: benchmark-small
+	$(RUN) experiments.benchmark --scenes='$(SMALL)/scenes/*' --methods=paper,baselines,tree \
+		--preset=tiny --steps=1250 --rays_per_pixel=4 --out=$(SMALL)/results
+	@echo "The table is $(SMALL)/results/tables/main.md"
 
 clean:
 	rm -rf $(VENV) $(BLENDER_VENV) .mypy_cache .pytest_cache .ruff_cache *.egg-info

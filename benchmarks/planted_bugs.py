@@ -383,8 +383,8 @@ BUGS = (
     Bug(
         "triangle of a leaf skipped",
         "geometry/traversal.py",
-        "for offset in range(1, bvh_nodes.LEAF_SIZE)",
-        "for offset in range(2, bvh_nodes.LEAF_SIZE)",
+        "for offset in range(1, bvh.LEAF_SIZE)",
+        "for offset in range(2, bvh.LEAF_SIZE)",
         ("geometry/test_bvh.py::test_hits_of_random_rays_equal_brute_force",),
     ),
     Bug(

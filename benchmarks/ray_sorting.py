@@ -20,8 +20,7 @@ from jaxtyping import Array, Float, Int, UInt32
 
 from refref_jax import numerics
 from refref_jax.compilation import native_loop
-from refref_jax.geometry import bvh_nodes
-from refref_jax.geometry.bvh import BVH, Hits, closest_hits
+from refref_jax.geometry.bvh import BVH, Hits, closest_hits, octant
 from refref_jax.geometry.rays import Rays
 
 _ORIGIN_BITS = 2
@@ -97,10 +96,10 @@ def _key(
     reciprocal = numerics.safe_reciprocal(direction)
     x, y, z = (jnp.where(direction < 0.0, lower, upper) - origin) * reciprocal
     leaving = origin + jnp.minimum(jnp.minimum(x, y), z) * direction
-    octant = bvh_nodes.octant(direction).astype(jnp.uint32)
+    eighth = octant(direction).astype(jnp.uint32)
     start = _morton(origin, lower, upper, _ORIGIN_BITS)
     end = _morton(leaving, lower, upper, _EXIT_BITS)
-    return (((octant << 3 * _ORIGIN_BITS) | start) << 3 * _EXIT_BITS) | end
+    return (((eighth << 3 * _ORIGIN_BITS) | start) << 3 * _EXIT_BITS) | end
 
 
 def _morton(

@@ -35,7 +35,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from benchmarks import ray_sorting
-from refref_jax.geometry import bvh, bvh_build, bvh_nodes, traversal
+from refref_jax.geometry import bvh, bvh_build, traversal
 from refref_jax.geometry.rays import Rays
 
 _ROUNDS = flags.DEFINE_integer("rounds", 15, "Timed repeats of every case.")
@@ -204,7 +204,7 @@ def _in_warp(tree: bvh.BVH, rays: Rays) -> tuple[jax.Array, jax.Array]:
 
 def _of(tree: bvh.BVH, rays: Rays) -> tuple[jax.Array, ...]:
     """Returns the arguments of a traversal."""
-    nodes = tree.nodes.reshape(-1, bvh_nodes.WORDS)
+    nodes = tree.nodes.reshape(-1, bvh.WORDS)
     return nodes, tree.facets, rays.origins, rays.directions, *_no_bounds()
 
 

@@ -57,7 +57,8 @@ app.check(_SCENES, scene_lists.expand)
 _METHODS = flags.DEFINE_list(
     "methods",
     ["straight", "oracle", "tree"],
-    f"Methods: {', '.join(methods.METHODS)}; main, ablations and all are groups of them.",
+    f"Methods: {', '.join(methods.METHODS)}; main, baselines, paper (those "
+    "that stand for a row of the paper's main table), ablations and all are groups of them.",
 )
 app.check(_METHODS, lambda words: methods.parse(words) if words else None)
 _EXTERNAL = flags.DEFINE_multi_string(

@@ -114,7 +114,7 @@ def _with_field(run: Path) -> Model:
     """Returns the model of a run.
 
     Raises:
-      ValueError: if it has a backdrop, Gaussian splats, or a field with sub-spaces.
+      ValueError: if it has a backdrop, Gaussian splats, or a field with sub-spaces or deformation.
     """
     model = checkpoint_io.load_model(run, step=_STEP.value)
     if model.config.splats is not None:
@@ -132,6 +132,12 @@ def _with_field(run: Path) -> Model:
             f"{run} has fields of kind {model.config.field.kind}, whose sub-spaces are blended "
             "along whole light paths: a point has no density and colour. Use experiments.render, "
             "or export a run with --field=zipnerf."
+        )
+    if registry.has_deformation(model.config.field):
+        raise ValueError(
+            f"{run} has fields of kind {model.config.field.kind}, which bend rays: where a point "
+            "of the scene is in them depends on the ray. Use experiments.render, or export a run "
+            "with --field=zipnerf."
         )
     return model
 

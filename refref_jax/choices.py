@@ -81,7 +81,17 @@ Paths = Literal["straight", "paper", "tree", "paper_no_reflection", "paper_no_ti
 PresetName = Literal["tiny", "small", "paper", "best"]
 """Sizes of a model and its training; see `training.presets`."""
 
-FieldName = Literal["zipnerf", "nerfacto", "msnerf", "neus", "unisurf", "tnsr", "splats"]
+FieldName = Literal[
+    "zipnerf",
+    "nerfacto",
+    "msnerf",
+    "neus",
+    "unisurf",
+    "tnsr",
+    "raydef",
+    "raydef_polyline",
+    "splats",
+]
 """Field kinds, the default first (`fields.registry`), and Gaussian splats, which have no field."""
 
 IndexFrom = Literal["given", "learned"]

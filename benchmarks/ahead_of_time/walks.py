@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from benchmarks.ahead_of_time.programs import SCENE
-from refref_jax.geometry import bvh, bvh_nodes, traversal
+from refref_jax.geometry import bvh, traversal
 from refref_jax.optics import path_tracing, wavefront
 from refref_jax.optics.media import Scene
 from refref_jax.optics.path_step import RayState
@@ -63,8 +63,8 @@ def count(preset: str, *, block: int) -> Walks:
 def _iterations(scene: Scene, state: RayState, alive: Bool[Array, ""]) -> Array:
     """Returns the number of iterations in which a ray walks through the tree."""
     tree = scene.surfaces.bvh
-    nodes = tree.nodes.reshape(-1, bvh_nodes.WORDS)
-    boxes = bvh_nodes.boxes(nodes)
+    nodes = tree.nodes.reshape(-1, bvh.WORDS)
+    boxes = bvh.boxes(nodes)
     limit = jnp.where(alive, jnp.inf, -1.0).astype(jnp.float32)
     ray, end, start = traversal.begin_ray(
         nodes, state.origin, state.direction, limit, state.exclude_primitive

@@ -5,10 +5,11 @@ Everything else is that of the preset for all methods: sizes, schedule and footp
 `--paths=paper --interior=field`, therefore has the published light paths and fields, and
 `oracle_as_published` also has the scene bounds, normals, losses and evaluation of the paper's
 released code; `docs/benchmark.md` lists the differences that remain. A baseline is another method
-of the paper's tables: its idea on the fields and preset of all others. Ablations of `oracle` remove
-one component; those of `tree`, our method, change one. An ablation that equals the preset is
-skipped (`same_as`), as is one that equals the scene's own choice (`same_inside`). Nerfacto's fields
-(`oracle_nerfacto`) define their own sizes, samples and footprint, a cone.
+of the paper's tables: its idea on the fields and preset of all others. The group `paper` has what
+stands for a row of the paper's main table. Ablations of `oracle` remove one component; those of
+`tree`, our method, change one. An ablation that equals the preset is skipped (`same_as`), as is one
+that equals the scene's own choice (`same_inside`). Nerfacto's fields (`oracle_nerfacto`) define
+their own sizes, samples and footprint, a cone.
 """
 
 import dataclasses
@@ -114,6 +115,22 @@ _ALL = (
         "baseline",
         (*_TNSR, "--surface_start=meshes"),
         ("meshes", "walls"),
+    ),
+    Method(
+        "raydef",
+        "Ray deformation (our reading)",
+        "baseline",
+        (*_STRAIGHT, "--field=raydef"),
+        (),
+        False,
+        "RayDef",
+    ),
+    Method(
+        "raydef_polyline",
+        "Ray deformation (polylines)",
+        "baseline",
+        (*_STRAIGHT, "--field=raydef_polyline"),
+        (),
     ),
     Method(
         "splats",
@@ -224,7 +241,7 @@ def parse(names: Sequence[str]) -> list[Method]:
     """Returns methods by name, in the order of tables.
 
     Args:
-      names: names of methods; `main`, `baselines`, `ablations` and `all` are groups of them.
+      names: names of methods; `main`, `baselines`, `paper`, `ablations` and `all` are groups.
 
     Raises:
       ValueError: if the list is empty, or a name is unknown.
@@ -239,6 +256,7 @@ def _meaning(word: str) -> list[str]:
     groups = {
         "main": [method.name for method in _ALL if method.group == "main"],
         "baselines": [method.name for method in _ALL if method.group == "baseline"],
+        "paper": [m.name for m in _ALL if m.published and m.group not in FULL],
         "ablations": [method.name for method in _ALL if method.group in FULL] + ["oracle", "tree"],
         "all": list(METHODS),
     }

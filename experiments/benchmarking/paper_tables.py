@@ -71,6 +71,12 @@ _SUBSTITUTED = (
     "are not ranked. The paper's are in their column as the most similar; their definition is not "
     "known. With natural backgrounds all distances are those inside the mask."
 )
+_COSTS = (
+    "Costs are means over scenes, of the machine that ran the jobs: seconds of all training steps, "
+    "compilation included, seconds to render an image, and the largest memory of the training's "
+    "process. The reconstruction that methods of R3F share is not included. The paper states none."
+)
+_ABSENT = "Published rows of methods that there are none of here: {names}."
 _FARTHEST = (
     "The {views} rendered test views of each scene that are farthest from any training view. The "
     "paper does not define a distance of poses; here it is sqrt(|c - c'|²/s² + a²) of positions c, "
@@ -108,11 +114,11 @@ def main_table(found: Sequence[Record]) -> Table:
         for background in (*BACKGROUNDS, published.ALL):
             own = select(found, category, background)
             if own:
-                rows = _ours(own, tables.MAIN, lambda record: record.metrics)
+                rows = _ours(own, tables.MAIN, lambda each: each.metrics | each.costs._asdict())
                 rows += _theirs(published.MAIN, category, background, tables.MAIN)
                 title = describe(category, background)
                 blocks.append(_marked(title, rows, tables.MAIN, own))
-    notes = _of_externals(found)
+    notes = (*_of_externals(found), _COSTS, *_of_absent())
     return _table("main", "Methods by category and background", notes, tables.MAIN, blocks)
 
 
@@ -199,6 +205,14 @@ def _without_ablations(found: Sequence[Record]) -> list[Record]:
 
 def _of_externals(found: Sequence[Record]) -> tuple[str, ...]:
     return (_GIVEN,) if any(record.method not in METHODS for record in found) else ()
+
+
+def _of_absent() -> tuple[str, ...]:
+    """Returns a note on the published rows of the main table that no method here stands for."""
+    ours = {method.published for method in METHODS.values()}
+    theirs = [row.method for row in published.read() if row.table == published.MAIN]
+    absent = [name for name in dict.fromkeys(theirs) if name not in ours]
+    return (_ABSENT.format(names=", ".join(absent)),) if absent else ()
 
 
 def _theirs(table: str, category: str, background: str, wanted: Sequence[Quantity]) -> list[Row]:

@@ -8,7 +8,8 @@ A `Quantity` defines a column: a value of a result, and whether higher or lower 
 three kinds of distances, see docs/metrics.md. Substituted distances, as in the first release of the
 paper's code, are not ranked: for methods that know the objects, they are exact inside the mask by
 definition. The error of a distance is taken inside the mask with a natural background, which is at
-infinity, and over the image otherwise, like the paper's DMAE.
+infinity, and over the image otherwise, like the paper's DMAE. Costs are those of `results.Costs`;
+they depend on the machine, and are not ranked either.
 
 The paper does not state over which pixels its DRMSE is computed. It is unlikely to be the image:
 the oracle's DRMSE is 0.00, but its DMAE over the image is 0.04 (cubes) and 0.15 (spheres), and an
@@ -118,8 +119,15 @@ DRMSE_SURFACE = Quantity(
 DRMSE_MEDIAN = Quantity("DRMSE, median", "DRMSE, median", "distance_rmse", "lower", 3, by_mask=True)
 
 
+TRAINING = Quantity("training, s", "training, s", "train_seconds", None, 0)
+RENDERING = Quantity("s per image", "s per image", "seconds_per_image", None, 2)
+MEMORY = Quantity("memory, MiB", "memory, MiB", "peak_host_mib", None, 0)
+DEVICE_MEMORY = Quantity("device memory, MiB", "device memory, MiB", "peak_device_mib", None, 0)
+
+
 _OF_IMAGES = (PSNR, PSNR_MASKED, SSIM, LPIPS, FLIP)
-MAIN = (*_OF_IMAGES, DMAE, DMAE_SURFACE, DMAE_MEDIAN)
+_OF_COSTS = (TRAINING, RENDERING, MEMORY, DEVICE_MEMORY)
+MAIN = (*_OF_IMAGES, DMAE, DMAE_SURFACE, DMAE_MEDIAN, *_OF_COSTS)
 TOP_VIEWS = (*_OF_IMAGES, DRMSE_MASKED, DRMSE, DRMSE_SURFACE, DRMSE_MEDIAN)
 ABLATIONS = (PSNR, PSNR_MASKED, SSIM, LPIPS, DMAE)
 

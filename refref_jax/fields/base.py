@@ -1,9 +1,10 @@
 """Interface of field kinds: their configurations, functions and arithmetic precision.
 
 A radiance field has two functions, `init_radiance` and `radiance`, and a third, `blend`, if it has
-sub-spaces, or `depth`, if it has a surface; a proposal field has `init_density` and `density`. All
-are pure functions, most of them over Gaussians in the unit cube. A field kind is a `FieldKind` in a
-module, and one line in `registry`, through which all other modules query fields.
+sub-spaces, `depth`, if it has a surface, or `deform`, if it bends straight rays; a proposal field
+has `init_density` and `density`. All are pure functions, most of them over Gaussians in the unit
+cube. A field kind is a `FieldKind` in a module, and one line in `registry`, through which all other
+modules query fields.
 
 The precision is float32, or mixed with bfloat16: tables are then read and matrices multiplied in
 bfloat16, while parameters, sums, gradients and outputs stay in float32. bfloat16 has only 8
@@ -157,6 +158,18 @@ class SurfaceSums(NamedTuple):
     share: Float[Array, "*paths"]
 
 
+class Offset(NamedTuple):
+    """Output of a deformation at a point of a straight ray.
+
+    Attributes:
+      position: offset of the point, in scene radii.
+      direction: offset of the unit direction, before it is normalised.
+    """
+
+    position: Float[Array, "*points 3"]
+    direction: Float[Array, "*points 3"]
+
+
 Seen = Radiance | SubSpaces | Surface
 """Output of a radiance field for one interval."""
 
@@ -217,6 +230,10 @@ class FieldKind(NamedTuple):
         returns the interval's optical depth; `None` if that is density times length.
       eikonal: weight of the eikonal loss of a surface; `None` if there is none.
       curvature: weight of the curvature loss of a surface.
+      deform: function of parameters, shape, a point of a straight ray in the unit cube, the ray's
+        unit direction and progress of the training, 0 to 1, that returns the offset of both; `None`
+        if light paths are those that are traced.
+      deformation: weights of the losses of a deformation: bends, turns and size.
     """
 
     radiance_config: type[RadianceConfig]
@@ -231,6 +248,8 @@ class FieldKind(NamedTuple):
     depth: Callable[[Params, Any, Surface, Array, Array, Array], Float[Array, ""]] | None = None
     eikonal: float | None = None
     curvature: float | None = None
+    deform: Callable[[Params, Any, Array, Array, Array], Offset] | None = None
+    deformation: tuple[float, float, float] | None = None
 
 
 def sums(seen: Surface, weights: Float[Array, " samples"]) -> SurfaceSums:

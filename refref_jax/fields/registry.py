@@ -8,12 +8,13 @@ from collections.abc import Mapping
 
 from jaxtyping import Array, Float
 
-from refref_jax.fields import msnerf, nerfacto, neus, tnsr, zipnerf
+from refref_jax.fields import msnerf, nerfacto, neus, raydef, tnsr, zipnerf
 from refref_jax.fields.base import (
     Blend,
     DensityConfig,
     FieldConfig,
     FieldKind,
+    Offset,
     Params,
     RadianceConfig,
     Seen,
@@ -28,6 +29,8 @@ KINDS: dict[str, FieldKind] = {
     "neus": neus.KIND,
     "unisurf": neus.UNISURF,
     "tnsr": tnsr.KIND,
+    "raydef": raydef.KIND,
+    "raydef_polyline": raydef.POLYLINE,
 }
 
 USUAL = "zipnerf"
@@ -69,6 +72,19 @@ def depth(
     return law(params, config, seen, direction, length, progress)
 
 
+def deform(
+    params: Params,
+    config: RadianceConfig,
+    position: Float[Array, "3"],
+    direction: Float[Array, "3"],
+    progress: Float[Array, ""],
+) -> Offset:
+    """Returns the offset of a point of a straight ray, and of its direction; see `FieldKind`."""
+    law = KINDS[config.kind].deform
+    assert law is not None, config.kind
+    return law(params, config, position, direction, progress)
+
+
 def has_sub_spaces(config: RadianceConfig) -> bool:
     """Returns whether a field has sub-spaces, so that only whole paths have a colour."""
     return KINDS[config.kind].blend is not None
@@ -77,6 +93,19 @@ def has_sub_spaces(config: RadianceConfig) -> bool:
 def has_surface(config: RadianceConfig) -> bool:
     """Returns whether a field has a surface, which stops light or bends it."""
     return KINDS[config.kind].eikonal is not None
+
+
+def has_deformation(config: RadianceConfig) -> bool:
+    """Returns whether a field bends straight rays, so that a point alone has no colour."""
+    return KINDS[config.kind].deform is not None
+
+
+def knots(config: RadianceConfig) -> int:
+    """Returns the number of knots at which a field bends each ray to a polyline; 0 if it does not.
+
+    A field with a deformation and without knots moves every sample.
+    """
+    return config.knots if isinstance(config, raydef.RaydefPolylineConfig) else 0
 
 
 def init_density(key: Array, config: DensityConfig) -> Params:

@@ -2,7 +2,7 @@
 
 Each level splits all of its large nodes at once, at the minimum of the surface area heuristic over
 all positions between two centroids along each of the three axes. The centroids are sorted once;
-every split preserves the three orders. The nodes are then packed into the tables of `bvh_nodes`.
+every split preserves the three orders. The nodes are then packed into the tables of `bvh`.
 
 A split sends the first `n` faces of a node, in the order of their centroids along an axis, to the
 left. Its cost is `area(left) leaves(left) + area(right) leaves(right)`. It counts the leaves that a
@@ -16,12 +16,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from refref_jax.geometry import bvh_nodes
-from refref_jax.geometry.bvh import BVH, LEAF_SIZE
+from refref_jax.geometry.bvh import BVH, LEAF_SIZE, OCTANTS, WORDS
 from refref_jax.numerics import host_array
 
-# Sign bit of each axis in the number of an octant, as in `bvh_nodes.octant`.
-_BACKWARDS = ((np.arange(bvh_nodes.OCTANTS)[:, None] >> np.arange(3)) & 1).astype(bool)
+# Sign bit of each axis in the number of an octant, as in `bvh.octant`.
+_BACKWARDS = ((np.arange(OCTANTS)[:, None] >> np.arange(3)) & 1).astype(bool)
 
 # Relative difference of costs that count as equal: rounding must not choose between them.
 _TIE = 1e-9
@@ -210,7 +209,7 @@ def pack_nodes(
     sizes, bounds = _subtree_sizes(levels), _bounds(levels, lower, upper)
     margin = np.spacing(np.float32(max(np.abs(lower).max(), np.abs(upper).max())))
     rows = sizes[0][0] + 1
-    tables = np.zeros((bvh_nodes.OCTANTS, rows, bvh_nodes.WORDS), np.int32)
+    tables = np.zeros((OCTANTS, rows, WORDS), np.int32)
     for octant, backwards in enumerate(_BACKWARDS):
         index = np.zeros(1, np.int64)
         for depth, (level, size, (low, high)) in enumerate(zip(levels, sizes, bounds, strict=True)):
@@ -340,7 +339,7 @@ def filled_up(bvh: BVH) -> BVH:
     for one of them serve all.
     """
     tables, rows = _filled(np.asarray(bvh.nodes), axis=1), bvh.nodes.shape[1]
-    octants = np.arange(bvh_nodes.OCTANTS, dtype=np.int32)[:, None]
+    octants = np.arange(OCTANTS, dtype=np.int32)[:, None]
     # Skip pointers count the rows of all tables. Walks that end at the last row pass the spare
     # ones.
     tables[:, : rows - 1, 6] += octants * (tables.shape[1] - rows)

@@ -4,7 +4,7 @@ As an option, a kernel of NVIDIA Warp traces single rays, each in a thread of it
 
 The rays of a packet share one node index, and the packet descends where any of its rays hits. Rays
 are stored component by component, so that XLA turns each operation of the single-ray functions in
-`bvh_nodes` and `rays` into one vector instruction. Packets are traced one after the other; the
+`bvh` and `rays` into one vector instruction. Packets are traced one after the other; the
 cost of a packet without active rays is negligible.
 
 A packet uses the node table of its rays' octant. If its rays have several octants, it traverses
@@ -32,7 +32,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float, Int
 
 from refref_jax.compilation import native_loop
-from refref_jax.geometry import bvh_nodes
+from refref_jax.geometry import bvh
 from refref_jax.geometry.rays import EDGE_TOLERANCE, facet_distance
 
 PACKET = 16
@@ -47,7 +47,7 @@ _READS_OF_RAY, _LEAVES_OF_RAY = 16, 4
 # Options with which Warp compiles operations as they are written.
 _WARP_OPTIONS = {"enable_backward": False, "fuse_fp": False, "fast_math": False}
 
-_DONE = bvh_nodes.OCTANTS
+_DONE = bvh.OCTANTS
 """Octant of a ray whose traversal is complete."""
 
 
@@ -64,7 +64,7 @@ class Packet(NamedTuple):
 
     origins: Float[Array, "*packets 3 rays"]
     directions: Float[Array, "*packets 3 rays"]
-    slabs: bvh_nodes.Slabs
+    slabs: bvh.Slabs
     octants: Int[Array, "*packets rays"]
     limits: Float[Array, "*packets rays"]
     exclude_primitive: Int[Array, "*packets rays"]
@@ -119,7 +119,7 @@ def _trace_packet(nodes: Int[Array, "rows 8"], packed: Array, packet: Packet) ->
         left = jnp.where(awake, _DONE, octants)
         return _Rounds(jnp.min(left), left, Closest(distances, walked.primitive_ids))
 
-    nothing = Closest(packet.limits, jnp.full_like(packet.exclude_primitive, bvh_nodes.NONE))
+    nothing = Closest(packet.limits, jnp.full_like(packet.exclude_primitive, bvh.NONE))
     start = _Rounds(jnp.min(packet.octants), packet.octants, nothing)
     return jax.lax.while_loop(lambda rounds: rounds.octant < _DONE, walk_octant, start).closest
 
@@ -147,14 +147,14 @@ def _walk(
         closest = _test_leaf(packed, packet, walk.leaf - 1, walk.closest)
         return _Walk(*find_leaf(walk.node, closest.distances), closest)
 
-    root = octant * (nodes.shape[0] // bvh_nodes.OCTANTS)
+    root = octant * (nodes.shape[0] // bvh.OCTANTS)
     start = _Walk(*find_leaf(root, closest.distances), closest)
     return jax.lax.while_loop(lambda walk: walk.leaf > 0, advance, start).closest
 
 
 def _visit_some(
     nodes: Int[Array, "rows 8"],
-    slabs: bvh_nodes.Slabs,
+    slabs: bvh.Slabs,
     reach: Float[Array, " rays"],
     index: Int[Array, ""],
 ) -> tuple[Int[Array, ""], Int[Array, ""]]:
@@ -173,7 +173,7 @@ def _visit_some(
 
 def _visit(
     nodes: Int[Array, "rows 8"],
-    slabs: bvh_nodes.Slabs,
+    slabs: bvh.Slabs,
     reach: Float[Array, " rays"],
     index: Int[Array, ""],
 ) -> tuple[Int[Array, ""], Int[Array, ""]]:
@@ -181,8 +181,8 @@ def _visit(
 
     The end of the table is always returned, so that every traversal terminates.
     """
-    node = bvh_nodes.read_node(nodes, index)
-    overlap = jax.vmap(bvh_nodes.overlaps, in_axes=(-1, None, None, 0))(
+    node = bvh.read_node(nodes, index)
+    overlap = jax.vmap(bvh.overlaps, in_axes=(-1, None, None, 0))(
         slabs, node.entry, node.exit, reach
     )
     hit = jnp.any(overlap)
@@ -204,7 +204,7 @@ def _test_leaf(
 
     def meet(offset: int) -> Closest:
         primitive_id = first + offset
-        facet = bvh_nodes.read_row(packed, primitive_id)
+        facet = bvh.read_row(packed, primitive_id)
         distances = jax.vmap(facet_distance, in_axes=(-1, -1, None))(
             packet.origins, packet.directions, facet
         )
@@ -214,7 +214,7 @@ def _test_leaf(
         )
 
     best = meet(0)
-    for offset in range(1, bvh_nodes.LEAF_SIZE):
+    for offset in range(1, bvh.LEAF_SIZE):
         found = meet(offset)
         best = _closer(found, best, found.distances < best.distances)
     tied = (best.distances == closest.distances) & (best.primitive_ids < closest.primitive_ids)
@@ -230,7 +230,7 @@ class Ray(NamedTuple):
 
     origin: Float[Array, "3"]
     direction: Float[Array, "3"]
-    slabs: bvh_nodes.Slabs
+    slabs: bvh.Slabs
     exclude_primitive: Int[Array, ""]
 
 
@@ -264,7 +264,7 @@ def trace_ray(
       The distance and index of the closest hit; the limit and `NONE` for a miss.
     """
     ray, end, start = begin_ray(nodes, origin, direction, limit, exclude_primitive)
-    boxes = bvh_nodes.boxes(nodes)
+    boxes = bvh.boxes(nodes)
     walk = jax.lax.while_loop(
         lambda walk: walk.node < end, lambda walk: advance_ray(boxes, packed, ray, end, walk), start
     )
@@ -279,11 +279,11 @@ def begin_ray(
     exclude_primitive: Int[Array, ""],
 ) -> tuple[Ray, Int[Array, ""], RayWalk]:
     """Returns a prepared ray, the end of its table, and the state of its loop; see `trace_ray`."""
-    ray = Ray(origin, direction, bvh_nodes.slabs(origin, direction), exclude_primitive)
-    rows = nodes.shape[0] // bvh_nodes.OCTANTS
-    root = bvh_nodes.octant(direction) * rows
+    ray = Ray(origin, direction, bvh.slabs(origin, direction), exclude_primitive)
+    rows = nodes.shape[0] // bvh.OCTANTS
+    root = bvh.octant(direction) * rows
     end = root + rows - 1
-    nothing = jnp.full_like(exclude_primitive, bvh_nodes.NONE)
+    nothing = jnp.full_like(exclude_primitive, bvh.NONE)
     return ray, end, RayWalk(jnp.where(limit >= 0.0, root, end), limit, nothing)
 
 
@@ -301,8 +301,8 @@ def advance_ray(
     seen = _Seen(walk.node, (jnp.zeros_like(walk.node),) * _LEAVES_OF_RAY)
 
     def read(_: int | Array, seen: _Seen) -> _Seen:
-        first, rows = seen.node, bvh_nodes.read_boxes(boxes, seen.node)
-        for offset in range(bvh_nodes.BOXES):
+        first, rows = seen.node, bvh.read_boxes(boxes, seen.node)
+        for offset in range(bvh.BOXES):
             visited = _visit_by_ray(rows[offset], ray, walk.distance, seen)
             is_next = (seen.node == first + offset) & (first + offset < end)
             seen = jax.tree.map(functools.partial(jnp.where, is_next), visited, seen)
@@ -328,8 +328,8 @@ def _visit_by_ray(
     box: Complex[Array, "4"], ray: Ray, reach: Float[Array, ""], seen: _Seen
 ) -> _Seen:
     """Visits the next node, whose box is given."""
-    entry, exit, link = bvh_nodes.corners_and_link(box)
-    hit, is_leaf = bvh_nodes.overlaps(ray.slabs, entry, exit, reach), link < 0
+    entry, exit, link = bvh.corners_and_link(box)
+    hit, is_leaf = bvh.overlaps(ray.slabs, entry, exit, reach), link < 0
     waiting = hit & is_leaf
     leaves = []
     for leaf in seen.leaves:
@@ -344,9 +344,9 @@ def _test_leaf_of_ray(
 ) -> RayWalk:
     """Returns the closest of the hit so far and the hits in one leaf; the lower index wins ties."""
     node, distance, primitive_id = walk
-    for offset in range(bvh_nodes.LEAF_SIZE):
+    for offset in range(bvh.LEAF_SIZE):
         candidate = jnp.maximum(leaf - 1, 0) + offset
-        facet = bvh_nodes.read_row(packed, candidate)
+        facet = bvh.read_row(packed, candidate)
         found = facet_distance(ray.origin, ray.direction, facet)
         closer = (found < distance) | ((found == distance) & (candidate < primitive_id))
         closer = closer & (candidate != ray.exclude_primitive) & (leaf > 0)
@@ -375,8 +375,8 @@ def trace_in_warp(
             f"The traversal in Warp takes rays of float32, not {origins.dtype}. Convert them, or "
             "unset REFREF_TRAVERSAL."
         )
-    rows = nodes.shape[0] // bvh_nodes.OCTANTS
-    roots = rows * jax.vmap(bvh_nodes.octant)(directions)
+    rows = nodes.shape[0] // bvh.OCTANTS
+    roots = rows * jax.vmap(bvh.octant)(directions)
     distances, primitive_ids = _warp_walk()(
         nodes.reshape(-1, 4),
         packed.reshape(-1, 4),
@@ -384,7 +384,7 @@ def trace_in_warp(
         roots + rows - 1,
         origins,
         directions,
-        *jax.vmap(bvh_nodes.slabs)(origins, directions),
+        *jax.vmap(bvh.slabs)(origins, directions),
         limits,
         exclude_primitive,
         launch_dims=limits.shape[0],
@@ -402,7 +402,7 @@ def _warp_walk() -> Any:
     if wp.config.log_level == wp.LOG_INFO:
         wp.config.log_level = wp.LOG_WARNING  # else it prints its devices and compilations
     overlaps, distance_to = _warp_overlaps(), _warp_distance()
-    leaf_size, none = bvh_nodes.LEAF_SIZE, bvh_nodes.NONE
+    leaf_size, none = bvh.LEAF_SIZE, bvh.NONE
 
     def traversal(
         nodes: wp.array(dtype=wp.vec4i),
@@ -446,10 +446,10 @@ def _warp_walk() -> Any:
 
 @no_type_check
 def _warp_overlaps() -> Any:
-    """Returns `bvh_nodes.overlaps` in Warp; a node is two rows of four words."""
+    """Returns `bvh.overlaps` in Warp; a node is two rows of four words."""
     import warp as wp
 
-    far_padding = bvh_nodes.FAR_PADDING
+    far_padding = bvh.FAR_PADDING
 
     @wp.func
     def overlaps(

@@ -344,7 +344,7 @@ def look_up(
 
     Raises:
       ValueError: if the model has a backdrop or Gaussian splats instead of fields, or its field has
-        sub-spaces or a surface.
+        sub-spaces, a surface or a deformation.
     """
     if config.splats is not None:
         raise ValueError(
@@ -365,6 +365,11 @@ def look_up(
         raise ValueError(
             f"A point has no density in fields of kind {config.field.kind}, whose opacity depends "
             "on the way through it. Use look_up_surface, or train with field=zipnerf."
+        )
+    if registry.has_deformation(config.field):
+        raise ValueError(
+            f"A point has no colour in fields of kind {config.field.kind}, where it depends on the "
+            "ray to what place it is moved. Train with field=zipnerf."
         )
     # Standard deviation of a cube along each axis.
     scale = jnp.full((1,), width, point.dtype) / jnp.sqrt(jnp.asarray(12.0, point.dtype))

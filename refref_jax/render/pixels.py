@@ -257,13 +257,14 @@ def render_ray(model: Model, ray: Rays) -> Float[Array, "3"]:
       ray: one camera ray, without leading axes.
 
     Raises:
-      ValueError: if the model has a backdrop instead of fields, or its field has sub-spaces or
-        a surface.
+      ValueError: if the model has a backdrop instead of fields, or its field has sub-spaces, a
+        surface or a deformation.
     """
     config, params = model.config, model.params
     if config.backdrop is not None:
         raise ValueError("This page shows fields, but the model has a backdrop. Use render_rays.")
-    if registry.has_sub_spaces(config.field) or registry.has_surface(config.field):
+    others = registry.has_sub_spaces, registry.has_surface, registry.has_deformation
+    if any(has(config.field) for has in others):
         raise ValueError(
             f"This page shows fields with density and one colour at a point, but the field is of "
             f"kind {config.field.kind}. Use render_rays."
@@ -284,12 +285,12 @@ def render_ray(model: Model, ray: Rays) -> Float[Array, "3"]:
         draw = functools.partial(middle, config, r, warp)
         histograms: list[Histogram] = []
         for proposal, learned in zip(config.proposals, params.proposals, strict=True):
-            s, t, x, _ = draw(histograms, proposal.samples)
+            s, t, x, *_ = draw(histograms, proposal.samples)
             sigma = density(learned, proposal.field, x)
             histograms.append(Histogram(s, _weights(sigma, jnp.diff(t) / config.radius)))
 
         # Query: density and colour of the multisamples, seen along the local direction.
-        s, t, x, points = draw(histograms, config.samples)
+        s, t, x, points, _ = draw(histograms, config.samples)
         seen = radiance(params.field, config.field, x, points.direction)
         assert isinstance(seen, Radiance)
         sigma, c = seen

@@ -24,15 +24,13 @@ from refref_jax.choices import LastSample
 from refref_jax.fields import base, registry
 from refref_jax.fields.base import Radiance, Seen, SubSpaces, Surface, SurfaceSums
 from refref_jax.optics.light_paths import LightPaths
+from refref_jax.render import learned_media
 from refref_jax.render.model import Layers, ModelConfig, Params
 from refref_jax.sampling import polylines, scene_bounds, stepfun
 from refref_jax.sampling.polylines import Gaussians, Polyline, PolylinePoint
 
 # Minimum dilation of a proposal, in units of the full path (Mip-NeRF 360, supplement).
 _DILATION_BIAS = 0.0025
-
-# Minimum length of a path, in units of the scene radius: `s` keeps four digits in float32.
-_SHORTEST = 1e-3
 
 # Rotation between adjacent cone patterns (Zip-NeRF, supplement).
 _PATTERN_TURN = jnp.pi / 6.0
@@ -149,12 +147,14 @@ class PathRadiance(NamedTuple):
       histograms: histogram of each proposal level, then of the radiance field.
       outside: whether each of the final intervals is outside the objects (by its middle).
       surface: sums for the losses of a surface, if the field has one.
+      bent: the bent ray, if the field has a deformation.
     """
 
     composite: Composite
     histograms: tuple[Histogram, ...]
     outside: Bool[Array, " samples"]
     surface: SurfaceSums | None = None
+    bent: learned_media.BentRay | None = None
 
 
 class Samples(NamedTuple):
@@ -166,12 +166,14 @@ class Samples(NamedTuple):
       gaussians: multisamples of each interval, in the unit cube.
       points: point of each interval, its middle or the end of the path, from whose direction the
         field is seen.
+      bent: the bent ray, if a deformation has moved the samples.
     """
 
     s: Float[Array, " edges"]
     t: Float[Array, " edges"]
     gaussians: Gaussians
     points: PolylinePoint
+    bent: learned_media.BentRay | None = None
 
 
 def path_radiance(
@@ -192,22 +194,30 @@ def path_radiance(
       jitter: jitter of the path.
       anneal: exponent on the proposals' weights, from 0 for uniform sampling to 1 for the
         proposals' distribution.
-      progress: progress of the training, 0 to 1, on which the opacity of a surface may depend; its
-        end by default.
+      progress: progress of the training, 0 to 1, on which the opacity of a surface and the details
+        of a deformation depend; its end by default.
     """
-    line = polyline(config, path)
+    line, bent = polyline(config, path), None
     warp = distance_warp(config, line)
-    samples, seen, histograms = _sampled(params, config, line, warp, jitter, anneal)
+    done = jnp.ones_like(path.radii) if progress is None else progress
+    if registry.knots(config.field):
+        learned = _field_of(params), config.field, config.domain
+        line, bent = learned_media.bend(*learned, line, warp, done)
+        warp = distance_warp(config, line)
+    samples, seen, histograms = _sampled(params, config, line, warp, jitter, anneal, done)
     if isinstance(seen, Surface):
-        weights, composited = _integrate_surface(params, config, seen, samples, progress)
+        weights, composited = _integrate_surface(params, config, seen, samples, done)
     else:
         weigh = functools.partial(_weigh, config, edges=samples.t)
         weights, composited = integrate(params, config, seen, samples.t, weigh=weigh)
+    if samples.bent is not None:
+        bent = samples.bent._replace(weights=jax.lax.stop_gradient(weights))
     return PathRadiance(
         composite=_in_arc_length(line, composited),
         histograms=(*histograms, Histogram(samples.s, weights)),
         outside=samples.points.outside,
         surface=base.sums(seen, weights) if isinstance(seen, Surface) else None,
+        bent=bent,
     )
 
 
@@ -231,7 +241,7 @@ def foreground_radiance(
     if config.interior == "field" or config.field_parts:
         line = polyline(config, path)
         length = jnp.max(line.knots, where=jnp.isfinite(line.knots), initial=0.0)
-        far = jnp.maximum(length, _SHORTEST * config.radius)
+        far = jnp.maximum(length, scene_bounds.SHORTEST * config.radius)
         warp = scene_bounds.DistanceWarp(0.0, far, config.radius)
         samples, seen, proposed = _sampled(params, config, line, warp, jitter, anneal)
         assert not isinstance(seen, Surface)  # `resolve` refuses a backdrop behind a surface
@@ -291,11 +301,10 @@ def _integrate_surface(
     config: ModelConfig,
     seen: Surface,
     samples: Samples,
-    progress: Float[Array, ""] | None,
+    progress: Float[Array, ""],
 ) -> tuple[Float[Array, " samples"], Composite]:
     """Returns the same as `integrate`, of a field with a surface, by the field's optical depths."""
     lengths = jnp.maximum(jnp.diff(samples.t), 0.0) / config.radius
-    progress = jnp.ones_like(lengths[0]) if progress is None else progress
     depth = jax.vmap(registry.depth, in_axes=(None, None, 0, 0, 0, None))(
         _field_of(params), config.field, seen, samples.points.direction, lengths, progress
     )
@@ -346,24 +355,32 @@ def _sampled(
     warp: scene_bounds.DistanceWarp,
     jitter: Jitter,
     anneal: Float[Array, ""],
+    progress: Float[Array, ""] | None = None,
 ) -> tuple[Samples, Seen, list[Histogram]]:
     """Returns the final samples, what the field returns there, and the proposals' histograms."""
 
-    def drawn(level: int, count: int) -> Samples:
+    def drawn(level: int, count: int, learned: base.Params) -> Samples:
         noise = jax.tree.map(lambda x: x[level], jitter)
-        return sample(config, line, warp, histograms, count, jitter=noise, anneal=anneal)
+        straight = sample(config, line, warp, histograms, count, jitter=noise, anneal=anneal)
+        if not registry.has_deformation(config.field) or registry.knots(config.field):
+            return straight
+        assert progress is not None  # `resolve` refuses a backdrop behind a deformation
+        given = config.field, config.domain, straight.gaussians, straight.points, progress
+        return Samples(straight.s, straight.t, *learned_media.move(learned, *given))
 
+    field = _field_of(params)
     histograms: list[Histogram] = []
     for level, proposal in enumerate(config.proposals):
-        samples = drawn(level, proposal.samples)
+        # Proposals see what the field sees, but do not train the deformation.
+        samples = drawn(level, proposal.samples, jax.lax.stop_gradient(field))
         density = jax.vmap(registry.density, in_axes=(None, None, 0))(
             params.proposals[level], proposal.field, samples.gaussians
         )
         histograms.append(Histogram(samples.s, _weigh(config, density, samples.t)))
 
-    samples = drawn(-1, config.samples)
+    samples = drawn(-1, config.samples, field)
     seen = jax.vmap(registry.radiance, in_axes=(None, None, 0, 0))(
-        _field_of(params), config.field, samples.gaussians, samples.points.direction
+        field, config.field, samples.gaussians, samples.points.direction
     )
     return samples, seen, histograms
 
@@ -374,19 +391,8 @@ def levels(config: ModelConfig) -> int:
 
 
 def distance_warp(config: ModelConfig, line: Polyline) -> scene_bounds.DistanceWarp:
-    """Returns the distance warp of a path, which ends on an opaque surface or the scene bounds.
-
-    The far distance is measured from the last bend, so that paths with many bends still reach the
-    background.
-    """
-    last = jnp.sum(jnp.isfinite(line.knots)) - 1
-    leave = scene_bounds.exit_distance(config.domain, line.points[last], line.directions[last])
-    far = line.knots[last] + jnp.where(jnp.isfinite(leave), leave, config.far)
-    if line.stop is not None:
-        far = jnp.where(jnp.isfinite(line.stop), line.stop, far)
-    # Keep a minimum length for samples even if the camera is on the scene bounds.
-    far = jnp.maximum(far, config.near + _SHORTEST * config.radius)
-    return scene_bounds.DistanceWarp(config.near, far, config.radius)
+    """Returns the distance warp of a path, which ends on an opaque surface or the scene bounds."""
+    return scene_bounds.warp_along(config.domain, line, near=config.near, far=config.far)
 
 
 def polyline(config: ModelConfig, path: LightPaths) -> Polyline:
@@ -425,8 +431,9 @@ def sample(
       anneal: exponent on the weights of the last histogram.
     """
     strata = (jnp.arange(count, dtype=jitter.offsets.dtype) + 0.5 + jitter.offsets) / count
-    # No interval straddles an interface, if there are enough edges.
-    bends = scene_bounds.to_unit(warp, line.knots[1:])
+    # No interval straddles an interface, if there are enough edges. Learned bends are none.
+    interfaces = line.knots[:0] if registry.knots(config.field) else line.knots[1:]
+    bends = scene_bounds.to_unit(warp, interfaces)
     s = stepfun.snap(_draw(config, histograms, strata, anneal), bends)
     t = scene_bounds.to_distance(warp, s)
     starts, ends = t[:-1], t[1:]

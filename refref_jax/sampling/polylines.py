@@ -139,6 +139,36 @@ def _advancing(path: LightPaths, line: Polyline, sampled: Bool[Array, " segments
     return line._replace(stop=starts[last] + (line.stop - line.arcs[last]))
 
 
+def through(line: Polyline, vertices: Float[Array, "segments 3"]) -> Polyline:
+    """Returns the line from the start of a straight one through other points.
+
+    Its last segment continues beyond the last of them. Footprints grow with arc length as along the
+    straight line. Where two vertices are equal, the segment between them has its direction.
+
+    Args:
+      line: a straight line, with one segment.
+      vertices: the points, in order.
+    """
+    starts = jnp.concatenate([line.points[:1], vertices[:-1]])
+    steps = vertices - starts
+    lengths = numerics.length(steps)
+    earlier = jnp.tril(jnp.ones((lengths.size, lengths.size), bool), k=-1)
+    arcs = jnp.sum(jnp.where(earlier, lengths[None, :], 0.0), axis=-1)
+    spread = jax.tree.map(lambda x: jnp.broadcast_to(x, (lengths.size, *x.shape[1:])), line)
+    points, turns = line.differentials
+    directions = jnp.where(lengths[:, None] > 0.0, numerics.normalize(steps), line.directions)
+    return line._replace(
+        points=starts,
+        directions=directions,
+        knots=arcs,
+        arcs=arcs,
+        outside=spread.outside,
+        differentials=RayDifferential(
+            points + arcs[:, None, None] * turns, spread.differentials.directions
+        ),
+    )
+
+
 def point_at(line: Polyline, t: Float[Array, ""]) -> PolylinePoint:
     """Returns the point at coordinate `t >= 0`.
 

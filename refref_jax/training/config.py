@@ -32,7 +32,7 @@ FIELD_ONLY = (
     *("data_loss", "interlevel_weight", "blurs", "distortion_weight", "hash_decay", "distortion"),
     *("path_losses", "steps", "warmup", "learning_rate", "final_learning_rate", "anneal", "batch"),
     *("pretraced_batches", "adam_b2", "sub_spaces", "eikonal_weight", "curvature_weight"),
-    *("gaussians", "splat_filter", *SURFACE_ONLY),
+    *("gaussians", "splat_filter", "deformation_weights", *SURFACE_ONLY),
 )
 """Options that only a radiance field reads."""
 
@@ -48,16 +48,12 @@ _FAR_FIELD = (
     *("interior", "tints", *FIELD_ONLY, *BACKDROP_ONLY),
 )
 
-# Options that determine the near and far planes, which earlier runs lack, and which the model has.
+# Options that determine near and far planes, which earlier runs lack, and numbers of samples.
 _BOUNDS = ("scene", "properties", "background", "radius", "contraction")
-
-# Options that determine the number of samples.
 _SAMPLES = (*_BOUNDS, *_OBJECTS, "centre", "paths", "max_bends", "interior", "far_field", *_KIND)
 
-# Most steps, rays and batches, which are 32-bit integers, and others.
+# Most steps, rays and batches, which are 32-bit integers, and others; numbers of multisamples.
 _MOST, _FINEST, _CELLS, _SEEDS, _MOST_SUB_SPACES = 2**31 - 1, 2**20, 2**13, 2**32, 64
-
-# Numbers of multisamples of the patterns in `sampling.polylines`; logarithm of a 32-bit hash.
 _PATTERNS, _MOST_ENTRIES = (1, 6), 31
 
 
@@ -155,8 +151,8 @@ class FieldConfig:
     Attributes:
       preset: Size of the model and length of its training.
       field: Field kind: zipnerf; nerfacto, without anti-aliasing; msnerf, with sub-spaces; neus or
-        unisurf, with the surface of an opaque object; tnsr, whose learned surface bends light; or,
-        in place of a field, Gaussian splats.
+        unisurf, with the surface of an opaque object; tnsr, whose learned surface bends light;
+        raydef or raydef_polyline, with a deformation of straight rays; or Gaussian splats.
       sub_spaces: Number of sub-spaces, only of field=msnerf.
       gaussians: Number of Gaussians, only of field=splats.
       splat_filter: Opacity of blurred Gaussians: reduced (mip) or kept (classic), of field=splats.
@@ -259,10 +255,9 @@ class FieldConfig:
             if (number := getattr(self, name)) is not None and not 0.0 <= number < math.inf:
                 raise ValueError(f"{name} is {number}. Give 0 or a positive number.")
         if self.log2_hashmap_size not in (None, *range(1, _MOST_ENTRIES + 1)):
-            size = self.log2_hashmap_size
             raise ValueError(
-                f"log2_hashmap_size is {size}, but it is the base-2 logarithm of a table's size. "
-                f"Give 1 to {_MOST_ENTRIES}, such as 17 for 131,072 entries."
+                f"log2_hashmap_size is {self.log2_hashmap_size}, but it is the base-2 logarithm of "
+                f"a table's size. Give 1 to {_MOST_ENTRIES}, such as 17 for 131,072 entries."
             )
 
 
@@ -283,6 +278,8 @@ class LossConfig:
         are reflected at the first surface (transmitted; the paper's released code).
       eikonal: Weight of the eikonal loss of a surface; by default the one of the field kind.
       curvature: Weight of the curvature loss of a surface; by default the one of the field kind.
+      deformation_weights: Weights of the losses of a deformation: its bends, its turns that its
+        bends do not explain, and its size, such as 3e-3,1e-3,1e-4; by default the field kind's.
     """
 
     data: choices.DataLoss = option("mse", name="data_loss")
@@ -295,12 +292,14 @@ class LossConfig:
     path_losses: choices.PathLosses = option("all")
     eikonal: float | None = option(None, name="eikonal_weight", after=("field",))
     curvature: float | None = option(None, name="curvature_weight", after=("field",))
+    deformation_weights: tuple[float, ...] | None = option(None, after=("field",))
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
         configuration.convert_fields(self)
         weights = (self.interlevel, self.distortion, self.hash_decay, self.tint_decay)
-        for number in (*weights, self.eikonal, self.curvature, *(self.blurs or ())):
+        others = (*(self.blurs or ()), *(self.deformation_weights or ()))
+        for number in (*weights, self.eikonal, self.curvature, *others):
             if number is not None and not 0.0 <= number < math.inf:
                 raise ValueError(
                     f"A weight or blur of the losses is {number}. Give 0 or a positive number."

@@ -310,8 +310,8 @@ def _anneal(step: Int[Array, ""], steps: int) -> Float[Array, ""]:
 def _progress(
     step: Int[Array, ""], config: TrainConfig, model: ModelConfig
 ) -> Float[Array, ""] | None:
-    """Returns the progress of the training, 0 to 1, on which only surfaces depend."""
-    if not registry.has_surface(model.field):
+    """Returns the progress of the training, 0 to 1, if surfaces or deformations depend on it."""
+    if not (registry.has_surface(model.field) or registry.has_deformation(model.field)):
         return None
     return step.astype(jnp.float32) / require(config.schedule.steps)
 

@@ -26,6 +26,7 @@ from refref_jax.fields.base import SurfaceSums
 from refref_jax.optics import light_paths
 from refref_jax.optics.light_paths import LightPaths
 from refref_jax.render import learned_media, pixels
+from refref_jax.render.learned_media import BentRay
 from refref_jax.render.model import Params
 from refref_jax.render.volume_rendering import Histogram
 from refref_jax.sampling import stepfun
@@ -35,6 +36,10 @@ _CHARBONNIER_PADDING = 0.001
 
 # Share of the training in which the weight of the curvature grows; factor per training after it.
 _CURVATURE_WARMUP, _CURVATURE_DECAY = 0.25, 1.38**-2.0
+
+# Weight of a bend where no light comes from; share of a ray that two of its points must be apart,
+# so that rounding makes no bends.
+_LEAST_BEND, _LEAST_GAP = 1e-3, 1e-4
 
 # Keeps the loss finite if a proposal is empty where the final histogram is not (Zip-NeRF).
 _INTERLEVEL_PADDING = 1e-5
@@ -97,6 +102,41 @@ def hash_decay(tables: Sequence[Float[Array, "_ _"]]) -> Float[Array, ""]:
     return sum((jnp.mean(jnp.square(table)) for table in tables), jnp.zeros(()))
 
 
+class Deformation(NamedTuple):
+    """Losses of a bent ray, or their sums over rays.
+
+    Attributes:
+      bends: sum of the changes of slope from point to point, each weighted by the light there and a
+        constant. Their lengths are not squared: a few bends cost less than an arc.
+      turns: mean of 1 minus the cosine between the turned direction and that of the moved points.
+      size: mean squared offset of points, in scene radii, and of directions.
+    """
+
+    bends: Float[Array, ""]
+    turns: Float[Array, ""]
+    size: Float[Array, ""]
+
+
+def deformation(bent: BentRay) -> Deformation:
+    """Returns losses that make a bent ray piecewise linear, consistent, and nearly straight.
+
+    Source: ours; "a regularization strategy that encourages piece-wise linear light paths" is all
+    that the abstract of Deng et al., Ray Deformation Networks (2024), says.
+    """
+    gaps = jnp.diff(bent.places)
+    apart = gaps > _LEAST_GAP * bent.places[-1]
+    steps = jnp.diff(bent.offsets, axis=0) / jnp.where(apart, gaps, 1.0)[:, None]
+    slopes = bent.straight[:-1] + jnp.where(apart[:, None], steps, 0.0)
+    weights = bent.weights
+    around = 0.25 * (weights[:-2] + 2.0 * weights[1:-1] + weights[2:]) + _LEAST_BEND
+    kinks = numerics.length(jnp.diff(slopes, axis=0))
+    bends = jnp.sum(jnp.where(apart[1:] & apart[:-1], around * kinks, 0.0))
+    agreement = numerics.dot(bent.turned[:-1], numerics.normalize(slopes))
+    turns = jnp.sum(jnp.where(apart, weights[:-1] * (1.0 - agreement), 0.0))
+    both = jnp.concatenate([bent.offsets, bent.turned - bent.straight], axis=-1)
+    return Deformation(bends, turns, jnp.mean(jnp.sum(jnp.square(both), axis=-1)))
+
+
 class StepReport(NamedTuple):
     """Losses and metrics of a step, before its update of the parameters.
 
@@ -111,6 +151,9 @@ class StepReport(NamedTuple):
       curvature: unweighted curvature loss.
       surface_share: share of the light that comes from inside the ball of the surface, or, if it
         bends light, of the paths that meet it.
+      bends: unweighted loss of the bends of a deformation, if the field has one.
+      turns: unweighted loss of its turns.
+      offsets: unweighted loss of its size.
     """
 
     loss: Float[Array, ""]
@@ -122,6 +165,9 @@ class StepReport(NamedTuple):
     eikonal: Float[Array, ""] | None = None
     curvature: Float[Array, ""] | None = None
     surface_share: Float[Array, ""] | None = None
+    bends: Float[Array, ""] | None = None
+    turns: Float[Array, ""] | None = None
+    offsets: Float[Array, ""] | None = None
 
 
 class Totals(NamedTuple):
@@ -133,6 +179,7 @@ class Totals(NamedTuple):
       distortion: sum of distortion losses.
       paths: number of paths in the interlevel and distortion losses.
       surface: sums for the losses of a surface, if the field has one.
+      deformation: sums of the losses of bent rays, if the field bends them.
     """
 
     linear: Float[Array, "rays 3"]
@@ -140,6 +187,7 @@ class Totals(NamedTuple):
     distortion: Float[Array, ""]
     paths: Float[Array, ""]
     surface: SurfaceSums | None = None
+    deformation: Deformation | None = None
 
 
 def total(light: pixels.Light, paths: LightPaths, config: LossConfig) -> Totals:
@@ -164,7 +212,10 @@ def total(light: pixels.Light, paths: LightPaths, config: LossConfig) -> Totals:
     spread = jax.vmap(distortion)(final, counted)
     count = jnp.sum(included, dtype=missed.dtype)
     surface = jax.tree.map(lambda x: _sum_where(included, x), light.paths.surface)
-    return Totals(light.linear, missed, _sum_where(included, spread), count, surface)
+    bent = light.paths.bent
+    losses = None if bent is None else jax.vmap(deformation)(bent)
+    losses = jax.tree.map(lambda x: _sum_where(included, x), losses)
+    return Totals(light.linear, missed, _sum_where(included, spread), count, surface, losses)
 
 
 def measure(
@@ -202,6 +253,12 @@ def measure(
     )
     psnr = -10.0 * jnp.log10(mse)
     report = StepReport(loss, psnr, interlevel, distortion, decay, jnp.mean(dropped))
+    if totals.deformation is not None:
+        bent = [numerics.safe_divide(each, totals.paths) for each in totals.deformation]
+        weights = require(config.deformation_weights)
+        loss += sum(weight * each for weight, each in zip(weights, bent, strict=True))
+        bends, turns, offsets = bent
+        return report._replace(loss=loss, bends=bends, turns=turns, offsets=offsets)
     if totals.surface is None:
         return report
     assert progress is not None

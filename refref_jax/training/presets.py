@@ -74,8 +74,8 @@ _NOT_READ = (
     *("interior", "tints", "tint_decay"),
 )
 
-# Blur of the interlevel loss for each proposal level (Zip-NeRF, supplement).
-_BLURS = (0.03, 0.003)
+# Blur of the interlevel loss for each proposal level (Zip-NeRF, supplement); losses of a surface.
+_BLURS, _SURFACE = (0.03, 0.003), ("eikonal", "curvature")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -252,12 +252,24 @@ def check_straight(config: TrainConfig) -> None:
             )
 
 
-def usual_paths(field: str, parts: int) -> tuple[Paths, str]:
-    """Returns the light paths of a scene with some number of parts, and the reason for them."""
+def usual_paths(config: TrainConfig, parts: int) -> tuple[Paths, str]:
+    """Returns the light paths of a scene with some number of parts, and the reason for them.
+
+    Raises:
+      ValueError: if the configuration has others, but its field bends straight rays.
+    """
+    field, given = config.model.field, config.paths
     if field == SPLATS:
         return "straight", "Gaussian splats have no light paths"
     if field == learned_surface.KIND:
         return "paper", "field=tnsr, whose surface bends light"
+    if registry.KINDS[field].deform is not None:
+        if given.name not in (None, "straight") or given.max_bends:
+            raise ValueError(
+                f"field={field} bends straight rays, not those of paths={given.name}. Use "
+                "paths=straight, or field=zipnerf."
+            )
+        return "straight", f"field={field} bends straight rays"
     return ("tree", "there are meshes") if parts else ("straight", "there are no meshes")
 
 
@@ -348,6 +360,7 @@ def loss(model: ModelConfig) -> LossConfig:
         hash_decay=kind.hash_decay,
         eikonal=kind.eikonal,
         curvature=kind.curvature,
+        deformation_weights=kind.deformation,
     )
 
 
@@ -359,22 +372,24 @@ def losses_of(model: ModelConfig, asked: LossConfig) -> dict[str, Any]:
       asked: overrides.
 
     Raises:
-      ValueError: if they have a weight for a surface, which the field does not have.
+      ValueError: if they have weights for a surface or a deformation that the field does not have.
     """
-    weights = {"eikonal_weight": asked.eikonal, "curvature_weight": asked.curvature}
-    for name, weight in weights.items():
+    bent = asked.deformation_weights
+    if bent and (len(bent) != 3 or not registry.has_deformation(model.field)):
+        raise ValueError(
+            f"deformation_weights has {len(bent)} numbers for field kind {model.field.kind}. Give "
+            "three to field=raydef, of bends, turns and size, such as 3e-3,1e-3,1e-4, or none."
+        )
+    for name in _SURFACE:
+        weight = getattr(asked, name)
         if weight is not None and not registry.has_surface(model.field):
             raise ValueError(
-                f"{name}={weight:g} has no effect on field kind {model.field.kind}, which has no "
-                "surface. Leave it out, or use field=neus."
+                f"{name}_weight={weight:g} has no effect on field kind {model.field.kind}, which "
+                "has no surface. Leave it out, or use field=neus."
             )
-    usual = loss(model)
-    return {
-        "blurs": usual.blurs,
-        "hash_decay": usual.hash_decay,
-        "eikonal_weight": usual.eikonal,
-        "curvature_weight": usual.curvature,
-    }
+    names = ("blurs", "hash_decay", "eikonal", "curvature", "deformation_weights")
+    usual = {name: getattr(loss(model), name) for name in names}
+    return {f"{name}_weight" if name in _SURFACE else name: x for name, x in usual.items()}
 
 
 PRESETS = {

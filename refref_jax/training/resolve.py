@@ -235,7 +235,7 @@ def _resolve_paths(
         )
     if config.paths.name is None:
         meshes.refuse_missing(facts.parts, facts.origins)
-    name, why = presets.usual_paths(config.model.field, found.parts)
+    name, why = presets.usual_paths(config, found.parts)
     config = _decide(config, reasons, why, paths=name)
     if bends:
         config = _decide(config, reasons, why, max_bends=learned_surface.BENDS)
@@ -362,12 +362,12 @@ def _resolve_far_field(
 
 def _needs_of_a_field(config: TrainConfig, facts: SceneFacts) -> list[str]:
     """Returns what a backdrop cannot model, even with a field in front of it."""
+    field, bent = config.model.field, ("raydef", "raydef_polyline")
     needs = {
-        "Gaussian splats (field=splats)": config.model.field == presets.SPLATS,
+        "Gaussian splats (field=splats)": field == presets.SPLATS,
         "straight rays (paths=straight)": facts.analysis.parts > 0 and not config.paths.max_bends,
         "contraction=always": config.model.contraction == "always",
-        "a surface (field=neus, unisurf or tnsr)": config.model.field
-        in ("neus", "unisurf", "tnsr"),
+        f"a surface or deformation (field={field})": field in ("neus", "unisurf", "tnsr", *bent),
     }
     return [name for name, holds in needs.items() if holds]
 

@@ -12,7 +12,7 @@ import pytest
 import trimesh
 
 from refref_jax import compilation
-from refref_jax.geometry import bvh, bvh_build, bvh_nodes, traversal
+from refref_jax.geometry import bvh, bvh_build, traversal
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import path_tracing
 from refref_jax.optics.path_settings import PathSettings
@@ -125,7 +125,7 @@ def _in_warp(name):
 
 
 def _is_hit(distances, primitive_ids):
-    return np.isfinite(distances) & (primitive_ids != bvh_nodes.NONE)
+    return np.isfinite(distances) & (primitive_ids != bvh.NONE)
 
 
 @pytest.mark.parametrize("name", _SCENES)

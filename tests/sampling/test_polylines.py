@@ -5,6 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from refref_jax.geometry.rays import Rays
+from refref_jax.optics import light_paths
 from refref_jax.optics.light_paths import PathStatus
 from refref_jax.sampling import polylines
 from tests.factories import made_paths
@@ -230,3 +232,56 @@ def test_transformations_change_nothing(name, transformation):
         made_paths.random_path(seed, bends=seed, segments=4) for seed in range(4)
     )
     transformation(_CASES[name], (paths, jnp.array([0.0, 1.0, 5.0, 20.0])))
+
+
+# --- a straight ray, bent ---
+
+
+def _straight(footprint="cone"):
+    path = made_paths.path([], [[0, 0, 1]], [0], origin=(1.0, 2.0, 3.0), radius=0.1)
+    if footprint == "differential":
+        ray = Rays(path.points[0], path.directions[0], path.radii)
+        begun = light_paths.begin_differential(ray, "differential")
+        path = path._replace(differentials=jax.tree.map(lambda x: x[None], begun))
+    return _whole(path)
+
+
+_through = jax.jit(polylines.through)
+
+
+def test_a_bent_ray_by_hand():
+    """Two units along z, three along x, and on along y: 1 unit behind the last vertex."""
+    vertices = [[1.0, 2.0, 5.0], [4.0, 2.0, 5.0], [4.0, 6.0, 5.0]]
+    bent = _through(_straight(), jnp.asarray(vertices, jnp.float32))
+    np.testing.assert_allclose(bent.knots, [0.0, 2.0, 5.0], atol=_DISTANCE)
+    np.testing.assert_allclose(bent.directions, [[0, 0, 1], [1, 0, 0], [0, 1, 0]], atol=1e-6)
+    seen = _at(bent, [0.0, 1.0, 4.0, 9.0, 10.0])
+    expected = [[1, 2, 3], [1, 2, 4], [3, 2, 5], [4, 6, 5], [4, 7, 5]]
+    np.testing.assert_allclose(seen.position, expected, atol=_DISTANCE)
+    np.testing.assert_allclose(seen.arc, [0.0, 1.0, 4.0, 9.0, 10.0], atol=_DISTANCE)
+    assert np.all(bent.outside)
+
+
+@pytest.mark.parametrize("footprint", ["cone", "differential"])
+def test_a_ray_through_points_of_its_own_stays_as_it_is(footprint):
+    line = _straight(footprint)
+    t = jnp.array([0.5, 2.0, 2.0, 7.0], jnp.float32)
+    bent = _through(line, line.points + t[:, None] * line.directions)
+    # Where two vertices are equal, the segment between them has the direction of the ray.
+    np.testing.assert_allclose(bent.directions, np.tile(line.directions, (4, 1)), atol=1e-6)
+    there = [0.0, 0.7, 2.0, 5.0, 20.0]
+    ours, theirs = _at(bent, there), _at(line, there)
+    np.testing.assert_allclose(ours.position, theirs.position, atol=_DISTANCE)
+    np.testing.assert_allclose(ours.footprint, theirs.footprint, atol=_DISTANCE)
+
+
+def test_gradients_by_vertices_are_numerical():
+    line = jax.tree.map(lambda x: np.asarray(x, np.float64), _straight()._replace(outside=None))
+    vertices = np.array([[1.0, 2.5, 4.0], [1.5, 2.0, 6.0], [1.0, 1.0, 9.0]])
+
+    def position(vertices):
+        whole = jax.tree.map(jnp.asarray, line)._replace(outside=jnp.ones(1, bool))
+        bent = polylines.through(whole, vertices)
+        return jax.vmap(polylines.point_at, in_axes=(None, 0))(bent, jnp.arange(4.0) + 0.3).position
+
+    gradients.assert_numerical(position, vertices)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from refref_jax.optics.light_paths import PathStatus
+from refref_jax.render.learned_media import BentRay
 from refref_jax.render.pixels import Light
 from refref_jax.render.volume_rendering import Composite, Histogram, PathRadiance
 from refref_jax.training import objective
@@ -344,3 +345,74 @@ _CASES = {
 def test_transformations_change_nothing(name, transformation):
     function, make = _CASES[name]
     transformation(function, jax.tree.map(jnp.asarray, make()))
+
+
+# --- bent rays ---
+
+_deformation = jax.jit(objective.deformation)
+_deformation_slopes = jax.jit(jax.grad(lambda bent: sum(objective.deformation(bent))))
+
+
+def _bent_ray(places, points, *, turned=None, weights=None):
+    """Returns a ray along z from the origin whose points at some distances are moved."""
+    places, points = np.asarray(places, np.float64), np.asarray(points, np.float64)
+    straight = np.tile([0.0, 0.0, 1.0], (len(places), 1))
+    even = np.full(len(places), 1.0 / len(places))
+    made = (
+        points - places[:, None] * straight,
+        places,
+        straight,
+        straight if turned is None else turned,
+        even if weights is None else weights,
+    )
+    return BentRay(*(jnp.asarray(x, jnp.float32) for x in made))
+
+
+def test_a_ray_without_bends_has_no_loss():
+    found = _deformation(
+        _bent_ray([0.1, 0.5, 0.6, 1.9], np.eye(3)[2] * [[0.1], [0.5], [0.6], [1.9]])
+    )
+    np.testing.assert_allclose(np.array(found), 0.0, atol=_ROUNDING)
+
+
+def test_a_bend_costs_twice_the_sine_of_half_its_angle():
+    """Nothing on both sides of the bend, where the light comes from or not."""
+    places = np.array([0.0, 0.3, 0.5, 1.0, 1.2, 2.0])
+    direction = np.array([np.sin(0.4), 0.0, np.cos(0.4)])
+    points = np.outer(np.minimum(places, 0.5), [0, 0, 1]) + np.outer(
+        np.maximum(places - 0.5, 0.0), direction
+    )
+    turned = np.where(places[:, None] < 0.5, [0.0, 0.0, 1.0], direction)
+    for weights, share in (([0, 0, 0.2, 0, 0, 0.8], 0.1), ([0, 0, 0, 0, 0, 1.0], 0.0)):
+        found = _deformation(_bent_ray(places, points, turned=turned, weights=weights))
+        np.testing.assert_allclose(found.bends, (share + 1e-3) * 2.0 * np.sin(0.2), rtol=1e-4)
+        np.testing.assert_allclose(found.turns, 0.0, atol=_ROUNDING)
+        offset = np.sum(np.square(points - np.outer(places, [0, 0, 1])), axis=-1)
+        size = np.mean(offset + np.sum(np.square(turned - [0.0, 0.0, 1.0]), axis=-1))
+        np.testing.assert_allclose(found.size, size, rtol=1e-5)
+
+
+def test_an_arc_costs_its_angle():
+    """Of equally many, equally weighted points, in the limit of many."""
+    angles = np.linspace(0.0, 1.0, 401)
+    points = np.stack([1.0 - np.cos(angles), 0.0 * angles, np.sin(angles)], axis=-1)
+    found = _deformation(_bent_ray(angles, points))
+    np.testing.assert_allclose(found.bends, 1.0 * (1.0 / 401 + 1e-3), rtol=0.02)
+
+
+def test_a_direction_that_the_bends_do_not_explain_costs_its_cosine():
+    places = np.array([0.0, 1.0, 2.0, 3.0])
+    turned = np.tile([np.sin(0.7), 0.0, np.cos(0.7)], (4, 1))
+    points = np.outer(places, [0, 0, 1])
+    found = _deformation(_bent_ray(places, points, turned=turned, weights=[0.1, 0.2, 0.3, 0.4]))
+    np.testing.assert_allclose(found.turns, 0.6 * (1.0 - np.cos(0.7)), rtol=1e-5)
+    np.testing.assert_allclose(found.bends, 0.0, atol=_ROUNDING)
+
+
+@pytest.mark.parametrize("scale", [0.0, 1e-12, 1.0, 1e6])
+def test_losses_of_bent_rays_are_finite(scale):
+    """Points at the same place, as of an empty interval, make no bend."""
+    places = np.array([0.0, 0.5, 0.5, 0.5 + 1e-9, 0.8])
+    points = scale * np.random.default_rng(0).normal(size=(5, 3))
+    bent = _bent_ray(places, points)
+    assert gradients.all_finite((_deformation(bent), _deformation_slopes(bent)))

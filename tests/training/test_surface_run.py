@@ -1,6 +1,5 @@
 """A field with a surface finds an opaque ball, and is trained, written and exported like others."""
 
-import dataclasses
 import functools
 import json
 
@@ -220,7 +219,7 @@ def test_commands_evaluate_and_export_the_surface(trained, tmp_path):
         ({"contraction": "always"}, r"contraction=always\)\. Use field=zipnerf"),
         (
             {"far_field": "backdrop", "paths": None},
-            r"cannot model a surface \(field=neus",
+            r"cannot model a surface or deformation \(field=neus",
         ),
         ({"eikonal_weight": -1.0}, r"weight or blur of the losses is -1\.0"),
         ({"field": "zipnerf", "eikonal_weight": 0.1}, r"eikonal_weight=0\.1 has no effect on"),
@@ -241,4 +240,5 @@ def test_weights_of_the_losses_are_those_of_the_kind():
         assert (resolved.config.losses.eikonal, resolved.config.losses.curvature) == (eikonal, 0.0)
     given = _config(eikonal_weight=0.3, curvature_weight=1e-3)
     resolved, _ = fit.prepare(given, report=lambda line: None)
-    assert dataclasses.astuple(resolved.config.losses)[-2:] == (0.3, 1e-3)
+    losses = resolved.config.losses
+    assert (losses.eikonal, losses.curvature, losses.deformation_weights) == (0.3, 1e-3, None)

@@ -65,6 +65,8 @@ def test_methods_are_in_the_order_of_the_table_and_none_hides_a_reconstruction()
         ("unisurf", ("walls",)),
         ("tnsr", ("meshes", "walls")),
         ("tnsr_true_start", ("meshes", "walls")),
+        ("raydef", ()),
+        ("raydef_polyline", ()),
         ("splats", ()),
     ]
     for group in ("main", "ablations"):

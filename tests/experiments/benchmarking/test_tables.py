@@ -8,9 +8,16 @@ import math
 import numpy as np
 import pytest
 
-from experiments.benchmarking import paper_tables, pose_space, published, summary, tables
+from experiments.benchmarking import (
+    methods,
+    paper_tables,
+    pose_space,
+    published,
+    summary,
+    tables,
+)
 from experiments.benchmarking.methods import METHODS
-from experiments.benchmarking.results import Image
+from experiments.benchmarking.results import Costs, Image
 from experiments.benchmarking.tables import NOTHING, Cell, Column, mean_over
 from refref_jax.data import scene_names
 from tests.factories.made_benchmark import made_record
@@ -234,6 +241,38 @@ def test_the_main_table_by_hand():
     # The paper's columns stay, though we know no LPIPS; FLIP, which nobody has, does not.
     labels = [column.label for column in table.columns]
     assert "LPIPS" in labels and "FLIP" not in labels and "DMAE, median" not in labels
+
+
+def test_costs_are_beside_the_numbers_and_are_not_ranked():
+    made = [
+        (made_record(f"cube_smcvx_{name}", method, psnr=20.0), costs)
+        for method, seconds in (("straight", 60.0), ("tree", 90.0))
+        for name, costs in (
+            ("ball", Costs(train_seconds=seconds, seconds_per_image=1.5, peak_host_mib=700.0)),
+            ("cone", Costs(train_seconds=seconds + 20.0, peak_host_mib=800.0)),
+        )
+    ]
+    table = paper_tables.main_table([record._replace(costs=costs) for record, costs in made])
+    labels = [column.label for column in table.columns]
+    assert labels[-3:] == ["training, s", "s per image", "memory, MiB"]  # no accelerator
+    assert all(column.better is None for column in table.columns[-3:])
+    tree = _rows(table.blocks[0])[_TREE]
+    assert [cell.mean for cell in tree.cells[-3:]] == [100.0, 1.5, 750.0]
+    assert tree.cells[-2].count == 1 and set(tree.marks[-3:]) == {""}
+    theirs = _rows(table.blocks[0], "published", published.PAPER)["Zip-NeRF"]
+    assert theirs.cells[-3:] == (NOTHING,) * 3 and "The paper states none" in " ".join(table.notes)
+
+
+def test_the_rows_of_the_paper_that_are_missing_here_are_named():
+    rows = {row.method for row in published.read() if row.table == published.MAIN}
+    group = methods.parse(["paper"])
+    assert {"straight", "msnerf", "neus", "raydef", "splats", "oracle", "r3f"} <= {
+        each.name for each in group
+    }
+    assert {each.published for each in group} <= rows and all(each.published for each in group)
+    (note,) = [n for n in paper_tables.main_table(_RESULTS).notes if n.startswith("Published rows")]
+    told = note.partition(": ")[2].rstrip(".").split(", ")
+    assert set(told) == rows - {each.published for each in group} and "NU-NeRF" in told
 
 
 def test_methods_that_lack_different_scenes_are_not_compared():
