@@ -235,7 +235,7 @@ def _resolve_paths(
         )
     name, why = presets.usual_paths(config.model.field, found.parts)
     config = _decide(config, reasons, why, paths=name)
-    if bends:
+    if bends and config.paths.name != "straight":
         config = _decide(config, reasons, why, max_bends=learned_surface.BENDS)
     paths = config.paths
     settings = make_path_settings(
