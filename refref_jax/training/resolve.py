@@ -237,7 +237,7 @@ def _resolve_paths(
         meshes.refuse_missing(facts.parts, facts.origins)
     name, why = presets.usual_paths(config, found.parts)
     config = _decide(config, reasons, why, paths=name)
-    if bends:
+    if bends and config.paths.name != "straight":
         config = _decide(config, reasons, why, max_bends=learned_surface.BENDS)
     paths = config.paths
     limits: Any = {"min_throughput": paths.min_throughput, "max_bends": paths.max_bends}

@@ -96,7 +96,7 @@ def test_resolve_leaves_nothing_open_and_is_idempotent(found, given):
     for option in options_of():
         left = straight and option.name == "reentry"
         unused = ("sub_spaces", "eikonal_weight", "curvature_weight", "gaussians", "splat_filter")
-        left |= option.name in (*BACKDROP_ONLY, *unused)
+        left |= option.name in (*BACKDROP_ONLY, *SURFACE_ONLY, *unused, "deformation_weights")
         assert left == (made.config.get(option.name) is None), option.name
         assert made.reasons[option.name]
     again = resolve(made.config, SceneFacts(found, CAMERAS, (), None, None, ()))
