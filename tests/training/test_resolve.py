@@ -28,6 +28,7 @@ from refref_jax.sampling.scene_bounds import Bounds
 from refref_jax.training import config_files, run_folder
 from refref_jax.training.config import (
     BACKDROP_ONLY,
+    SURFACE_ONLY,
     FieldConfig,
     LossConfig,
     PathsConfig,
