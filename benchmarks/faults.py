@@ -8,8 +8,8 @@ and the making of a data set. Each is killed (`kill -9`) at random moments and r
 result is bit for bit that of a command without faults. Then their disk is full, or read-only; two
 processes use a run at once; checkpoints, metrics and scenes are damaged or change under a run; the
 clock jumps; memory is short. Every fault must end in one line without a traceback, and the work
-must continue once its cause is removed. The table says how each try ended; `lost` and `traceback` are
-failures. Small disks are `tmpfs` in a namespace of their own (Linux; `unshare`).
+must continue once its cause is removed. The table says how each try ended; `lost` and `traceback`
+are failures. Small disks are `tmpfs` in a namespace of their own (Linux; `unshare`).
 """
 
 import csv
@@ -289,18 +289,15 @@ def _flip(path: Path) -> None:
 
 
 def change_scene(campaign: Campaign) -> None:
-    """Changes an image of the scene of an interrupted run, and restores it."""
+    """Resumes a run with a scene of which an image has changed, and then with its own."""
     out = campaign.work / "changed"
     shutil.copytree(campaign.work / "half", out)
     scene = shutil.copytree(campaign.scene, campaign.work / "changed_scene" / campaign.scene.name)
     image = next((scene / "train").iterdir())
     iio.imwrite(image, 255 - iio.imread(image))
-    config = out / "config.json"
-    text = config.read_text("utf-8")
-    config.write_text(text.replace(str(campaign.scene), str(scene)), "utf-8")
-    ended = campaign.start(campaign.commands["train"], out, again=True)
+    moved = faults_commands.commands(scene, campaign.trained)["train"]
+    ended = campaign.start(moved, out, again=True)
     campaign.expect("scene that changes", "train", ended, image.stem, "Restore the scene")
-    config.write_text(text, "utf-8")
     campaign.finish("scene that changes", "train", out)
 
 
@@ -355,7 +352,8 @@ def _stop_half_way(campaign: Campaign) -> None:
     """Makes the run that damages are tried on: half of its steps are taken."""
     out = campaign.work / "half"
     command = campaign.commands["train"]
-    campaign.start(command, out, kill=lambda: faults_commands.newest_step(out) >= 6)
+    complete = out / "checkpoints" / "6" / "checksums.json"
+    campaign.start(command, out, kill=complete.is_file)
     assert faults_commands.newest_step(out) >= 6
 
 
