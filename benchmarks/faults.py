@@ -8,8 +8,8 @@ and the making of a data set. Each is killed (`kill -9`) at random moments and r
 result is bit for bit that of a command without faults. Then their disk is full, or read-only; two
 processes use a run at once; checkpoints, metrics and scenes are damaged or change under a run; the
 clock jumps; memory is short. Every fault must end in one line without a traceback, and the work
-must continue once its cause is removed. The table says how each try ended; `lost` and `traceback` are
-failures. Small disks are `tmpfs` in a namespace of their own (Linux; `unshare`).
+must continue once its cause is removed. The table says how each try ended; `lost` and `traceback`
+are failures. Small disks are `tmpfs` in a namespace of their own (Linux; `unshare`).
 """
 
 import csv
@@ -288,19 +288,22 @@ def _flip(path: Path) -> None:
     path.write_bytes(content)
 
 
+def _begin_line(out: Path) -> None:
+    """Adds the beginning of a line of metrics, as a process that is killed leaves it."""
+    with (out / "metrics.jsonl").open("a", encoding="utf-8") as file:
+        file.write('{"step": 7, "lo')
+
+
 def change_scene(campaign: Campaign) -> None:
-    """Changes an image of the scene of an interrupted run, and restores it."""
+    """Resumes a run with a scene of which an image has changed, and then with its own."""
     out = campaign.work / "changed"
     shutil.copytree(campaign.work / "half", out)
     scene = shutil.copytree(campaign.scene, campaign.work / "changed_scene" / campaign.scene.name)
     image = next((scene / "train").iterdir())
     iio.imwrite(image, 255 - iio.imread(image))
-    config = out / "config.json"
-    text = config.read_text("utf-8")
-    config.write_text(text.replace(str(campaign.scene), str(scene)), "utf-8")
-    ended = campaign.start(campaign.commands["train"], out, again=True)
+    moved = faults_commands.commands(scene, campaign.trained)["train"]
+    ended = campaign.start(moved, out, again=True)
     campaign.expect("scene that changes", "train", ended, image.stem, "Restore the scene")
-    config.write_text(text, "utf-8")
     campaign.finish("scene that changes", "train", out)
 
 
@@ -348,14 +351,15 @@ def jobs(campaign: Campaign) -> Iterator[tuple[Callable[..., None], tuple[object
         cut, flipped = "checkpoint cut short", "checkpoint with a flipped bit"
         yield damage, (campaign, cut, lambda x: _cut(_largest(x)), "damaged", "Remove")
         yield damage, (campaign, flipped, lambda x: _flip(_largest(x)), "damaged", "Remove")
-        yield damage, (campaign, "metrics cut short", lambda x: _cut(x / "metrics.jsonl"))
+        yield damage, (campaign, "metrics cut short", _begin_line)
 
 
 def _stop_half_way(campaign: Campaign) -> None:
     """Makes the run that damages are tried on: half of its steps are taken."""
     out = campaign.work / "half"
     command = campaign.commands["train"]
-    campaign.start(command, out, kill=lambda: faults_commands.newest_step(out) >= 6)
+    complete = out / "checkpoints" / "6" / "checksums.json"
+    campaign.start(command, out, kill=complete.is_file)
     assert faults_commands.newest_step(out) >= 6
 
 

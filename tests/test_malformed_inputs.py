@@ -19,7 +19,7 @@ from PIL import Image
 from refref_jax.data import ALLOW_OUTSIDE, SceneError, file_inside, image_files
 from refref_jax.training.config import TrainConfig
 from refref_jax.training.resolve import read_facts, resolve
-from tests.factories.small_scenes import HEIGHT, WIDTH, write_grey, write_scene
+from tests.factories.small_scenes import HEIGHT, WIDTH, png_chunk, write_grey, write_scene
 
 _TRANSFORMS, _SCENE, _MESH = "transforms_train.json", "scene.json", "meshes/ball_glass.ply"
 _IMAGE, _MASK, _DEPTH = "train/r_000.png", "mask/train/r_000.png", "depth/train/r_000.exr"
@@ -104,13 +104,13 @@ def _save(image, kind, **options):
 
 def _declared_size(width, height):
     """A PNG whose header declares a size, and whose pixels are missing."""
-
-    def chunk(name, content):
-        checksum = zlib.crc32(name + content)
-        return struct.pack(">I", len(content)) + name + content + struct.pack(">I", checksum)
-
-    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
-    return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", zlib.compress(b"")) + chunk(b"IEND", b"")
+    header = png_chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + header
+        + png_chunk(b"IDAT", zlib.compress(b""))
+        + png_chunk(b"IEND", b"")
+    )
 
 
 def _as_folder(name):

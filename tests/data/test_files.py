@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 from refref_jax.data import image_files
+from tests.factories.small_scenes import png_chunk
 from tests.laws.expectations import scene_error
 
 
@@ -164,17 +165,12 @@ def test_sixteen_bits_are_refused(png, read):
         read(png)
 
 
-def _chunk(name, content):
-    checksum = zlib.crc32(name + content)
-    return struct.pack(">I", len(content)) + name + content + struct.pack(">I", checksum)
-
-
 def test_sixteen_bits_of_colour_are_refused(png):
     # One pixel: no library here writes such a file, and Pillow reads it as 8 bits.
     colour = 2
-    header = _chunk(b"IHDR", struct.pack(">IIBBBBB", 1, 1, 16, colour, 0, 0, 0))
-    pixel = _chunk(b"IDAT", zlib.compress(b"\0" + struct.pack(">HHH", 1, 300, 65535)))
-    png.write_bytes(b"\x89PNG\r\n\x1a\n" + header + pixel + _chunk(b"IEND", b""))
+    header = png_chunk(b"IHDR", struct.pack(">IIBBBBB", 1, 1, 16, colour, 0, 0, 0))
+    pixel = png_chunk(b"IDAT", zlib.compress(b"\0" + struct.pack(">HHH", 1, 300, 65535)))
+    png.write_bytes(b"\x89PNG\r\n\x1a\n" + header + pixel + png_chunk(b"IEND", b""))
     assert iio.imread(png, plugin="pillow").dtype == np.uint8
     with scene_error(png.name, "more than 8 bits", "8-bit PNG"):
         image_files.read_rgb(png)

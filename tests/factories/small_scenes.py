@@ -1,6 +1,8 @@
 """Writes a small scene in the local layout, and breaks it."""
 
 import json
+import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -40,6 +42,12 @@ def truncate(path: Path, share: float = 0.5) -> None:
     """Cuts a file off, as an interrupted copy does."""
     content = path.read_bytes()
     path.write_bytes(content[: int(share * len(content))])
+
+
+def png_chunk(name: bytes, content: bytes) -> bytes:
+    """Returns a chunk of a PNG file, with its length and checksum."""
+    checksum = zlib.crc32(name + content)
+    return struct.pack(">I", len(content)) + name + content + struct.pack(">I", checksum)
 
 
 def write_grey(path: Path, pixels: np.ndarray) -> None:
