@@ -49,9 +49,6 @@ _CHECKSUMS = "checksums.json"
 
 _PIECE = 1 << 24
 
-# Seconds that a checkpoint may take. Orbax measures them with the time of day, which may jump.
-_PATIENCE = 10**9
-
 _LONGEST_REASON = 200
 
 PARAMS_ITEM = "params"
@@ -139,8 +136,7 @@ def open_checkpoints(run: Path, *, keep: int | None = None) -> ocp.CheckpointMan
     """
     # Orbax warns about its option `read_only` each time; a manager that only restores does not
     # write either.
-    patient = ocp.AsyncOptions(timeout_secs=_PATIENCE)
-    chosen = {"create": False} if keep is None else {"max_to_keep": keep, "async_options": patient}
+    chosen = {"create": False} if keep is None else {"max_to_keep": keep}
     return ocp.CheckpointManager(
         (run / CHECKPOINTS).absolute(),
         item_names=(PARAMS_ITEM, TRAINING_ITEM),
