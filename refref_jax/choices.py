@@ -1,7 +1,9 @@
 """Values of the options of scenes and configurations (standard library only)."""
 
 import math
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple, TypeVar, get_args
+
+_Value = TypeVar("_Value")
 
 Colour = tuple[float, float, float]
 """Linear RGB."""
@@ -157,3 +159,17 @@ def side_of(rays_per_pixel: int) -> int:
         return side
     nearest = " or ".join(str(s**2) for s in (side, side + 1) if s)
     raise ValueError(f"{rays_per_pixel} rays a pixel do not make a square grid. Give {nearest}.")
+
+
+def require(value: _Value | None) -> _Value:
+    """Returns the value of an option that `training.resolve` has decided.
+
+    Raises:
+      ValueError: if it is `None`, which leaves the decision open.
+    """
+    if value is None:
+        raise ValueError(
+            "An option that training needs is None, which leaves it open. Use the configuration "
+            "that training.resolve returns."
+        )
+    return value

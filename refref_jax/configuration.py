@@ -28,8 +28,6 @@ from typing import Any, NamedTuple, TypeVar
 
 from refref_jax import atomic_files
 
-_Value = TypeVar("_Value")
-
 _Config = TypeVar("_Config")
 
 Variants = Mapping[type, Mapping[str, type]]
@@ -499,17 +497,3 @@ def one_of(*names: str) -> Callable[[Any], str]:
         return value
 
     return check
-
-
-def require(value: _Value | None) -> _Value:
-    """Returns the value of an option that `training.resolve` has decided.
-
-    Raises:
-      ValueError: if it is `None`, which leaves the decision open.
-    """
-    if value is None:
-        raise ValueError(
-            "An option that training needs is None, which leaves it open. Use the configuration "
-            "that training.resolve returns."
-        )
-    return value

@@ -16,8 +16,8 @@ from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 from refref_jax import choices, configuration
+from refref_jax.choices import require as require
 from refref_jax.configuration import Option, option
-from refref_jax.configuration import require as require
 from refref_jax.optics.path_settings import Reentry, check_max_bends, check_min_throughput
 
 # Options that determine the objects, and the shape of the fields.
