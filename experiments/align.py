@@ -8,6 +8,7 @@ outlines of the masks come first, then the light that is refracted through the o
 used like a reconstruction. `docs/captures.md` explains the method.
 """
 
+import dataclasses
 from pathlib import Path
 
 from absl import flags
@@ -42,8 +43,11 @@ def main() -> None:
     scene = cli_scenes.opened(_SCENE.value)
     told = scene_properties.read(scene, overlay=_PROPERTIES.value)
     folder = None if _MESH.value is None else Path(_MESH.value)
-    if folder is not None and not any(folder.glob("*.ply")):
-        raise ValueError(f"--mesh={folder} is not a folder with .ply files. Give one.")
+    if folder is not None:
+        if not any(folder.glob("*.ply")):
+            raise ValueError(f"--mesh={folder} is not a folder with .ply files. Give one.")
+        described = {name: part for name, part in told.parts.items() if (folder / name).is_file()}
+        told = dataclasses.replace(told, parts=described)
     parts = meshes.read_meshes(scene, indices=indices, properties=told, folder=folder)
     alignment.placed_object(parts)  # refuses unsuitable ones before anything is written
     space, radius, centre = chain.bounds_of(
