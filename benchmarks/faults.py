@@ -165,7 +165,7 @@ def kill_and_repeat(campaign: Campaign, name: str, number: int, kills: int) -> N
             again = False
         if again and faults_commands.newest_step(out) < before:
             campaign.note("kill -9", command.name, _LOST, f"{out}: step {before} is gone")
-    for _ in range(kills - 1):
+    for _ in range(max(0, kills - left - 1)):
         campaign.note("kill -9", command.name, "killed again")
     campaign.finish("kill -9", name, out, again=again)
     shutil.rmtree(out, ignore_errors=True)
@@ -201,8 +201,8 @@ def _script(campaign: Campaign, name: str, place: Path, *, first: str, between: 
     copied = f"cp -r {campaign.trained} {out};" if name == "evaluate" else ""
     return f"""mount -t tmpfs -o size=1g none {place}; {copied} {first}
 {start} > {place}.first 2>&1; echo $? >> {place}.first
-{between} [ -e {out}/config.json -o -e {out}/benchmark.json -o {name} = reconstruct ] &&
-{again} > {place}.second 2>&1 || {start} > {place}.second 2>&1
+{between} if [ -e {out}/config.json -o -e {out}/benchmark.json -o {name} = reconstruct ]
+then {again} > {place}.second 2>&1; else {start} > {place}.second 2>&1; fi
 cp -r {out} {place}.copy"""
 
 

@@ -32,6 +32,7 @@ _IOR = cli_flags.ior()
 _SPACE = r3f_flags.space()
 _PROPERTIES = cli_flags.properties()
 _SEED = cli_flags.seed()
+cli_flags.allow_outside()
 _OUT = cli_flags.out("Folder to write to.")
 _OVERWRITE = cli_flags.overwrite("an earlier alignment")
 
@@ -44,10 +45,15 @@ def main() -> None:
     told = scene_properties.read(scene, overlay=_PROPERTIES.value)
     folder = None if _MESH.value is None else Path(_MESH.value)
     if folder is not None:
-        if not any(folder.glob("*.ply")):
-            raise ValueError(f"--mesh={folder} is not a folder with .ply files. Give one.")
+        if not folder.is_dir() or not meshes.mesh_files(scene, folder=folder):
+            raise ValueError(f"--mesh={folder} is not a folder with .ply files. Give a folder.")
         described = {name: part for name, part in told.parts.items() if (folder / name).is_file()}
         told = dataclasses.replace(told, parts=described)
+    if told.rule not in (None, "nested"):
+        raise ValueError(
+            f"The rule of this scene is {told.rule}, but objects are aligned under the rule nested "
+            "only. Remove the rule from scene.json if its parts do not overlap."
+        )
     parts = meshes.read_meshes(scene, indices=indices, properties=told, folder=folder)
     alignment.placed_object(parts)  # refuses unsuitable ones before anything is written
     space, radius, centre = chain.bounds_of(

@@ -97,7 +97,7 @@ FieldName = Literal[
 """Field kinds, the default first (`fields.registry`), and Gaussian splats, which have no field."""
 
 IndexFrom = Literal["given", "learned"]
-"""Source of the index of refraction of a learned surface; see `fields.neus.TnsrConfig`."""
+"""Source of the index of refraction of a learned surface; see `fields.tnsr.TnsrConfig`."""
 
 SurfaceStart = Literal["ball", "meshes"]
 """Where a learned surface begins; see `training.config.FieldConfig`."""

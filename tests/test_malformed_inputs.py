@@ -16,7 +16,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-from refref_jax.data import ALLOW_OUTSIDE, SceneError, file_inside, image_files
+from refref_jax.data import ALLOW_OUTSIDE, SceneError, file_inside, image_files, scene_folder
 from refref_jax.training.config import TrainConfig
 from refref_jax.training.resolve import read_facts, resolve
 from tests.factories.small_scenes import HEIGHT, WIDTH, png_chunk, write_grey, write_scene
@@ -301,7 +301,7 @@ _CASES = {
 
 def _read(scene):
     config = TrainConfig().override(scene=str(scene), preset="tiny", batch=16)
-    resolve(config, read_facts(config.scene))
+    return resolve(config, read_facts(config.scene))
 
 
 def test_there_are_more_than_eighty_and_the_scene_itself_is_read(sound):
@@ -324,17 +324,33 @@ def test_a_malformed_input_is_refused_in_one_line(sound, tmp_path, spoil, name, 
 def test_files_outside_are_allowed_to_a_trusted_scene(sound, tmp_path, monkeypatch):
     scene = shutil.copytree(sound, tmp_path / sound.name)
     _outside(scene)
-    with pytest.raises(SceneError, match=ALLOW_OUTSIDE):
-        _read(scene)
+    for value in ("", "0"):
+        monkeypatch.setenv(ALLOW_OUTSIDE, value)
+        with pytest.raises(SceneError, match=ALLOW_OUTSIDE):
+            _read(scene)
     monkeypatch.setenv(ALLOW_OUTSIDE, "1")
-    _read(scene)
+    assert _read(scene).config.model.preset == "tiny"
+
+
+def test_names_through_a_link_to_the_scene_are_inside_it(sound, tmp_path):
+    scene, link = shutil.copytree(sound, tmp_path / sound.name), tmp_path / "link"
+    link.symlink_to(scene)
+    name = str(scene / "train" / "r_000.png")
+    assert file_inside([link], name, where="file_path", path=link / _TRANSFORMS) == scene / name
+
+
+def test_lenses_that_differ_by_rounding_are_read(sound, tmp_path):
+    scene = shutil.copytree(sound, tmp_path / sound.name)
+    middle = {"cx": 0.5 * (WIDTH - 1), "cy": 0.5 * (HEIGHT - 1)}
+    _in(_TRANSFORMS, k1=1e-12, p2=-1e-9, fl_x=None, **middle)(scene)
+    assert scene_folder.read_frames(scene, "train").cameras.width == WIDTH
 
 
 def test_links_within_a_scene_lead_where_they_lead(sound, tmp_path):
     scene = shutil.copytree(sound, tmp_path / sound.name)
     shutil.move(scene / "train", tmp_path / "elsewhere")
     (scene / "train").symlink_to(tmp_path / "elsewhere")
-    _read(scene)
+    assert _read(scene).model == _read(sound).model
 
 
 @pytest.mark.parametrize(
@@ -348,7 +364,7 @@ def test_keys_of_other_programs_are_ignored(sound, tmp_path, values):
     scene = shutil.copytree(sound, tmp_path / sound.name)
     _in(_TRANSFORMS, **values)(scene)
     _frames(partial(dict.update, rotation=0.01, normal_file_path="./normal/r_000"))(scene)
-    _read(scene)
+    assert _read(scene).model == _read(sound).model
 
 
 def test_a_scene_without_meshes_can_be_trained_along_straight_rays(sound, tmp_path):
@@ -375,3 +391,9 @@ def test_a_file_may_be_in_any_of_several_folders(tmp_path):
     for name in ("../c.png", "../bc.png", "/c.png", "c/../../c.png"):
         with pytest.raises(SceneError, match="x: image is "):
             inside(name)
+
+
+def test_photographs_with_a_preview_behind_them_are_read(tmp_path):
+    picture = Image.new("RGB", (6, 4), (200, 100, 50))
+    picture.save(tmp_path / "phone.jpg", "MPO", save_all=True, append_images=[picture])
+    assert image_files.read_rgb(tmp_path / "phone.jpg").shape == (4, 6, 3)

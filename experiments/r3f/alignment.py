@@ -30,12 +30,12 @@ from refref_jax.data import SceneError, mesh_queries, meshes, scene_names
 from refref_jax.data.mesh_queries import Containment
 from refref_jax.data.meshes import MeshPart
 from refref_jax.data.scene_assembly import shaded_mesh
-from refref_jax.geometry.triangle_meshes import Mesh, diameter, volume
+from refref_jax.geometry.triangle_meshes import Mesh, diameter, is_closed, volume
 from refref_jax.optics.interface_rules import NO_PARENT, nested
 from refref_jax.optics.media import Interfaces
 from refref_jax.reconstruct import ReconstructionError, gauss_newton, model_selection
 from refref_jax.reconstruct.gauss_newton import Candidate, Fit, Steps
-from refref_jax.reconstruct.masks import Outlines
+from refref_jax.reconstruct.masks import OUTLINE_DEVIATION, Outlines
 from refref_jax.reconstruct.model_selection import Trial
 from refref_jax.reconstruct.photometry import Backdrop
 from refref_jax.reconstruct.shapes import LARGEST_STEP, LARGEST_TURN, Posed
@@ -52,6 +52,10 @@ _TURN, _SHIFT, _GROWTH = 0.2, 0.1, 0.2
 
 # Reach of the outlines in the rounds of the first fit, pixels.
 _REACHES = (20.0, 8.0, 3.0)
+
+# Largest components of a placement, in standard deviations of the prior; largest mean distance of
+# the outlines, in pixels, and their least number of points.
+_FARTHEST, _MOST_PIXELS, _FEWEST_POINTS = 3.0, 1.0, 100
 
 # Steps by light: outlines have placed the object within the detail of a backdrop blurred once.
 _STEPS = Steps(blurs=(1, 0, 0, 0, 0, 0), rays=20_000)
@@ -91,7 +95,9 @@ class PlacementFacts:
     @property
     def error(self) -> float | None:
         """Mean error of the judges that is left, sRGB."""
-        return None if self.outlines is None else min(self.outlines, self.light or math.inf)
+        if self.given is None or self.outlines is None or self.light is None:
+            return None
+        return min(self.given, self.outlines, self.light)
 
 
 class Background(NamedTuple):
@@ -248,7 +254,8 @@ def align(
 
     Raises:
       SceneError: if there are no parts, or one is not a dielectric.
-      ValueError: if the scene has no masks, or no pixel inside or outside of them.
+      ValueError: if the scene has no masks, or no pixel inside or outside of them, or the object
+        cannot be aligned with them.
     """
     model, tree = placed_object(parts)
     outer = [part for part, parent in enumerate(tree.parents) if parent == NO_PARENT]
@@ -258,14 +265,15 @@ def align(
     for reach in _REACHES:
         outlines = Outlines(views, seed=seed, reach=reach, creased=True)
         x = fit_placement(model, outlines, outermost=outer, x=x)
-    surface = index_stage.learn_backdrop(scene, out, seed=seed, **background._asdict())
+    _refuse_far(model, x, outlines, outer)
     by_outlines = _as_fit(model, x, outlines, outer)
+    surface = index_stage.learn_backdrop(scene, out, seed=seed, **background._asdict())
     if surface is None:
         facts = _facts(model, by_outlines, (None, None, None), seen)
     else:
         outlines = Outlines(views, common=light_stage.WIDER, seed=seed, creased=True)
         found = _by_light(model, by_outlines, surface, seen, outlines, outer)
-        before, after = found[0], min(found[1:], key=lambda trial: trial.error)
+        before, after = found[0], min(found, key=lambda trial: trial.error)
         facts = _facts(model, after.fit, tuple(trial.error for trial in found), seen)
         _draw(out / FIGURE, scene, before, after, surface, seen)
     configuration.write(out / PLACEMENT, facts)
@@ -277,16 +285,19 @@ def placed_object(parts: Sequence[MeshPart]) -> tuple[PlacedObject, Containment]
     """Returns the object as a model of its placement, and its nesting.
 
     Raises:
-      SceneError: if there are no parts, or one is not a smooth, clear or stained dielectric.
+      SceneError: if there are no parts, or one is open, or no smooth, clear or stained dielectric.
     """
     if not parts:
         raise SceneError("There are no meshes to align. Give --mesh, or add them to the scene.")
     for part in parts:
-        if part.material.kind != "dielectric" or part.material.roughness:
+        material = part.material
+        if material.kind != "dielectric" or material.roughness or material.dispersion:
             raise SceneError(
-                f"{part.name} is rough, or not a dielectric, and alignment follows light through "
-                "smooth glass and liquids only. Align the other parts alone."
+                f"{part.name} is rough or dispersive, or not a dielectric, and alignment follows "
+                "light through smooth glass and liquids of one index only. Align other parts alone."
             )
+        if not is_closed(part.faces):
+            raise SceneError(f"{part.name} is not closed, so it has no outline. Close the mesh.")
     tree = mesh_queries.find_containment(parts)
     interfaces = nested(
         [part.index for part in parts],
@@ -301,15 +312,37 @@ def _as_fit(
     model: PlacedObject, x: Float[np.ndarray, "7"], outlines: Outlines, outer: Sequence[int]
 ) -> Fit:
     """Returns a placement by outlines, with its covariance."""
-    rows = _rows(model, outlines, outer)(model.pose(x))
+    rows = _rows(outlines, outer)(model.pose(x))
     matrix = (rows.weights[:, None] * rows.derivatives).T @ rows.derivatives
     return Fit(x, np.linalg.inv(matrix + model.prior(x)[0]), ())
 
 
+def _refuse_far(
+    model: PlacedObject, x: Float[np.ndarray, "7"], outlines: Outlines, outer: Sequence[int]
+) -> None:
+    """Refuses a placement that does not explain the outlines.
+
+    Raises:
+      ValueError: if the object went far from where it was, or its outlines are not those of masks.
+    """
+    rows = _rows(outlines, outer)(model.pose(x))
+    precision, _ = model.prior(x)
+    far = np.abs(x) * np.sqrt(np.diag(precision)) > _FARTHEST
+    mean = float(np.mean(np.abs([*rows.errors, 0.0]))) * OUTLINE_DEVIATION
+    if far.any() or mean > _MOST_PIXELS or len(rows.errors) < _FEWEST_POINTS:
+        turn, shift = np.degrees(np.linalg.norm(x[:3])), np.linalg.norm(x[3:6])
+        raise ValueError(
+            f"The object cannot be aligned: turned by {turn:.1f} degrees, moved by {shift:.3g} "
+            f"world units and scaled by {math.exp(x[6]):.3g}, {len(rows.errors)} points of its "
+            f"outlines are near those of the masks, {mean:.2g} pixels off on average. Check that "
+            "the meshes are those of the scene, in its units, or bring them within some 5 degrees "
+            "and 5 percent first."
+        )
+
+
 def _rows(
-    model: PlacedObject, outlines: Outlines, outer: Sequence[int]
+    outlines: Outlines, outer: Sequence[int]
 ) -> Callable[[gauss_newton.Candidate], gauss_newton.Rows]:
-    del model
     return lambda candidate: outlines.of_surfaces([candidate.parts[part] for part in outer])
 
 
@@ -329,7 +362,7 @@ def _by_light(
             surface,
             seen.fitted,
             settings=_STEPS,
-            outlines=_rows(model, outlines, outer),
+            outlines=_rows(outlines, outer),
             progress=lambda step, facts: bar.show(
                 step, f"error {min(facts.before, facts.after):.4f}"
             ),

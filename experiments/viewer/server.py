@@ -130,9 +130,14 @@ def refusal(headers: Mapping[str, str], *, host: str, pages: int) -> str | None:
       pages: number of pages that are open.
     """
     asked, origin = headers.get("Host", ""), headers.get("Origin")
-    if host in _LOOPBACK and urllib.parse.urlsplit(f"//{asked}").hostname not in _LOOPBACK:
+    try:
+        named = urllib.parse.urlsplit(f"//{asked}").hostname
+        page = asked if origin is None else urllib.parse.urlsplit(origin).netloc
+    except ValueError:
+        return "The request has no valid Host or Origin."
+    if host in _LOOPBACK and named not in _LOOPBACK:
         return f"The viewer answers to localhost only, not to {asked}."
-    if origin is not None and urllib.parse.urlsplit(origin).netloc != asked:
+    if page != asked:
         return f"A page of {origin} may not use the viewer."
     if headers.get("Upgrade", "").lower() == "websocket" and pages >= _MOST_PAGES:
         return f"{pages} pages are open. Close one first."

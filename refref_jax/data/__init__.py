@@ -46,7 +46,8 @@ def file_inside(folders: Sequence[Path], name: Any, *, where: str, path: Path) -
         raise SceneError(f"{path}: {where} is {shown}. Use the name of a file, as in train/r_000.")
     found = os.path.abspath(folders[0] / plain)
     inside = any(Path(found).is_relative_to(os.path.abspath(folder)) for folder in folders)
-    if not inside and not os.environ.get(ALLOW_OUTSIDE):
+    inside |= any(Path(found).resolve().is_relative_to(folder.resolve()) for folder in folders)
+    if not inside and os.environ.get(ALLOW_OUTSIDE) != "1":
         raise SceneError(
             f"{path}: {where} is {shown}, which is outside of {folders[0]}. Move the file there, "
             f"or, if you trust this scene, use --allow_outside (in Python, set {ALLOW_OUTSIDE}=1)."

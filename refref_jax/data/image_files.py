@@ -135,6 +135,8 @@ def _read_header(path: Path) -> tuple[int, int]:
         with image:
             (width, height), pictures = image.size, getattr(image, "n_frames", 1)
             mode = image.mode
+            if image.format == "MPO":  # a photograph with a preview or a depth map behind it
+                pictures = 1
     except (Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
         raise SceneError(f"{path} has more than {_MOST_PIXELS} pixels. Scale it down.") from error
     except Exception as error:  # Pillow raises OSError, SyntaxError and its own

@@ -400,7 +400,7 @@ def check_meshes(
       SceneError: if there is an error among the findings.
     """
     findings = lint(parts, tree, rule=rule)
-    advice = "note: there are no meshes, so all rays are straight."
+    advice = "note: there are no meshes that bend light."
     if parts:
         advice = str(advise(parts, tree))
     refuse_errors(findings)

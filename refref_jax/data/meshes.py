@@ -161,7 +161,7 @@ def read_meshes(
     overrides = dict(indices or {})
     for name, index in overrides.items():
         check_index(name, index)
-    paths = mesh_files(scene) if folder is None else sorted(folder.glob("*.ply"))
+    paths = mesh_files(scene, folder=folder)
     found = properties or scene_properties.read(scene)
     table = INDEX_OF_REFRACTION | dict(found.indices) | overrides
     _check_overrides(overrides, paths, table)
@@ -222,17 +222,22 @@ def read_part(path: Path, *, index: float, shading: Shading = "auto") -> MeshPar
     return _read_part(path, {path.stem: index}, PartDescription(shading=shading), {})
 
 
-def mesh_files(scene: Path) -> list[Path]:
+def mesh_files(scene: Path, *, folder: Path | None = None) -> list[Path]:
     """Returns the mesh files of a scene, ordered by name.
 
     They are `meshes/*.ply` in its folder. If a folder of the raw release has none, they are those
     of `published_meshes` in `mesh_files/{category}` next to `image_data`.
 
+    Args:
+      scene: the scene folder.
+      folder: another folder of meshes.
+
     Raises:
       SceneError: if there are only meshes in another format.
     """
-    folder, name = scene / "meshes", None
-    if not folder.is_dir() and (name := scene_names.of_raw_folder(scene)) is not None:
+    given, name = folder is not None, None
+    folder = folder or scene / "meshes"
+    if not given and not folder.is_dir() and (name := scene_names.of_raw_folder(scene)) is not None:
         places = [above / "mesh_files" for above in scene.resolve().parents[2:4]]
         category = scene_names.CATEGORIES[name.category]
         folder = next((each for each in places if each.is_dir()), folder) / category

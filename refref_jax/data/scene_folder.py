@@ -265,8 +265,12 @@ def _refuse_other_lenses(record: dict[str, Any], cameras: Cameras, path: Path) -
     centre = {"cx": 0.5 * width, "cy": 0.5 * height, "w": float(width), "h": float(height)}
     distortion = dict.fromkeys(("k1", "k2", "k3", "k4", "p1", "p2"), 0.0)
     for key, expected in (focal | centre | distortion).items():
-        value = configuration.as_number(record.get(key, expected))
-        if not math.isclose(value, expected, rel_tol=_SAME_LENS):
+        if record.get(key) is None:
+            continue
+        value = configuration.as_number(record[key])
+        # Programs write rounding errors of k1, and a centre of (w - 1) / 2.
+        near = {**dict.fromkeys(distortion, 1e-6), "cx": 0.5, "cy": 0.5}.get(key, 0.0)
+        if not math.isclose(value, expected, rel_tol=_SAME_LENS, abs_tol=near):
             raise SceneError(
                 f"{path}: {key} is {configuration.abridged(record[key])}, but camera_angle_x and "
                 f"the images mean {expected:g}: this layout has undistorted pinholes with the "

@@ -17,8 +17,10 @@ Source: Deng et al., Differentiable Neural Surface Refinement for Modeling Trans
 """
 
 import dataclasses
+import math
 from typing import Literal
 
+import jax
 import jax.numpy as jnp
 from jax.tree_util import Partial
 from jaxtyping import Array, Float
@@ -58,13 +60,13 @@ class TnsrConfig(SurfaceConfig):
         least, most = INDICES
         if not least <= self.index <= most:
             raise ValueError(
-                f"The index of a surface is {self.index}. Give a number from {least} to {most}, "
-                "relative to the medium around it."
+                f"The index of a surface is {self.index}. Give surface_index a number from {least} "
+                f"to {most}, relative to the medium around it."
             )
         if not 0.0 <= self.straight < 1.0:
             raise ValueError(
-                f"The share of steps with straight rays is {self.straight}. Give 0 or more, below "
-                "1."
+                f"The share of steps with straight rays is {self.straight}. Give straight_share 0 "
+                "or more, below 1."
             )
 
 
@@ -109,11 +111,19 @@ def opaque(config: SurfaceConfig) -> SurfaceConfig:
 
 
 def index_of(params: NeusParams, config: TnsrConfig) -> Float[Array, ""]:
-    """Returns the index of refraction inside the surface, relative to that outside."""
+    """Returns the index of refraction inside the surface, relative to that outside.
+
+    A learned one changes by `neus.PACE` per unit of its parameter at first, and approaches its
+    bounds smoothly: where it were cut off, it would never return.
+    """
     index = jnp.asarray(config.index, jnp.float32)
     if params.index_change is None:
         return index
-    return jnp.clip(index + neus.PACE * params.index_change, *INDICES)
+    least, most = INDICES
+    share = min(max((config.index - least) / (most - least), 1e-3), 1.0 - 1e-3)
+    pace = neus.PACE / ((most - least) * share * (1.0 - share))
+    moved = math.log(share / (1.0 - share)) + pace * params.index_change
+    return least + (most - least) * jax.nn.sigmoid(moved)
 
 
 def level_set(

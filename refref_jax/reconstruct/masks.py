@@ -148,9 +148,12 @@ def _listed(views: Int[np.ndarray, " views"]) -> str:
     return f"Views {names}{', ...' if len(views) > 5 else ''}: {len(views)}"
 
 
-# Standard deviation of a signed distance, and the distance at which a point has lost half of its
-# weight, in pixels; points that are further away are of an inner edge, which a mask does not show.
-_DEVIATION, _WRONG, _FURTHEST = 0.3, 1.0, 3.0
+OUTLINE_DEVIATION = 0.3
+"""Standard deviation of a signed distance, the unit of the errors of outlines, in pixels."""
+
+# Distance at which a point has lost half of its weight, in pixels; points that are further away are
+# of an inner edge, which a mask does not show.
+_WRONG, _FURTHEST = 1.0, 3.0
 
 # Largest number of rim points per view: neighbours have the same error, so more add nothing.
 _POINTS = 100
@@ -239,8 +242,10 @@ class Outlines:
         errors = np.concatenate([each[0] for each in found])
         derivatives = scipy.sparse.vstack([each[1] for each in found]).tocsr()
         wrong = _WRONG * self._reach / _FURTHEST
-        weights = 1.0 / (1.0 + (errors * _DEVIATION / wrong) ** 2) ** 2
-        return Rows(errors, derivatives @ part.by_vertices, weights, self._common / _DEVIATION)
+        weights = 1.0 / (1.0 + (errors * OUTLINE_DEVIATION / wrong) ** 2) ** 2
+        return Rows(
+            errors, derivatives @ part.by_vertices, weights, self._common / OUTLINE_DEVIATION
+        )
 
     def of_surfaces(self, parts: Sequence[Posed]) -> Rows:
         """Returns the equations of the outlines of surfaces that depend on the same unknowns."""
@@ -281,9 +286,9 @@ class Outlines:
         blocks = np.concatenate([(1.0 - share[near]) * rows, share[near] * rows], axis=1)
         at = 3 * np.stack([first, second], axis=1)[..., None] + np.arange(3)
         row = np.repeat(np.arange(len(near)), 6)
-        entries = (blocks.ravel() / _DEVIATION, (row, at.ravel()))
+        entries = (blocks.ravel() / OUTLINE_DEVIATION, (row, at.ravel()))
         matrix = scipy.sparse.coo_array(entries, shape=(len(near), columns)).tocsr()
-        return distance[near] / _DEVIATION, matrix
+        return distance[near] / OUTLINE_DEVIATION, matrix
 
 
 def fit_profile(
@@ -319,7 +324,7 @@ def _fitted(outer: Revolution, outlines: Outlines) -> Revolution:
 def _error(outer: Revolution, outlines: Outlines) -> float:
     """Returns the mean distance from the outlines, in standard deviations, up to the largest."""
     errors = outlines.of_surface(outer.pose(outer.start())).errors
-    return float(np.mean(np.minimum(np.abs(errors), _WRONG / _DEVIATION)))
+    return float(np.mean(np.minimum(np.abs(errors), _WRONG / OUTLINE_DEVIATION)))
 
 
 def _vertex_normals(part: Posed) -> Float[np.ndarray, "vertices 3"]:

@@ -11,6 +11,7 @@ compared with the checksums of its files before it is read. One without them is 
 version, or its writer was killed when it was complete.
 """
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -27,6 +28,7 @@ import orbax.checkpoint as ocp
 
 from refref_jax import atomic_files, configuration
 from refref_jax.fields import registry
+from refref_jax.fields.neus import NeusParams
 from refref_jax.geometry.bvh import BVH
 from refref_jax.geometry.surfaces import Surfaces
 from refref_jax.optics.media import Interfaces, Scene, meshes_of
@@ -185,14 +187,14 @@ def restore(manager: ocp.CheckpointManager, step: int, items: dict[str, Any]) ->
     try:
         return _restore(manager, step, items)
     except Exception as error:  # Orbax raises the errors of its storage
-        try:
-            former = _restore(manager, step, _replace_each(items, Params, _FormerParams))
-            return ocp.args.Composite(**_replace_each(dict(former), _FormerParams, Params))
-        except Exception:
-            raise ValueError(
-                f"The checkpoint {folder} cannot be read ({_brief(error)}). Remove it to use an "
-                "older one, or train again."
-            ) from error
+        for now, before in _FORMERLY.items():
+            with contextlib.suppress(Exception):
+                former = _restore(manager, step, _replace_each(items, now, before))
+                return ocp.args.Composite(**_replace_each(dict(former), before, now))
+        raise ValueError(
+            f"The checkpoint {folder} cannot be read ({_brief(error)}). Remove it to use an "
+            "older one, or train again."
+        ) from error
 
 
 def write_checksums(run: Path, step: int) -> None:
@@ -241,6 +243,17 @@ class _FormerParams(NamedTuple):
     dyes: Any
 
 
+class _FormerNeusParams(NamedTuple):
+    """The fields of `NeusParams` as earlier versions stored them."""
+
+    surface: Any
+    around: Any
+    log_sharpness: Any
+
+
+_FORMERLY: dict[Any, Any] = {Params: _FormerParams, NeusParams: _FormerNeusParams}
+
+
 def _restore(
     manager: ocp.CheckpointManager, step: int, items: dict[str, Any]
 ) -> ocp.args.Composite:
@@ -249,9 +262,12 @@ def _restore(
 
 
 def _replace_each(tree: Any, old: Any, new: Any) -> Any:
-    """Replaces records by records of another type with the same values."""
+    """Replaces records by records of another type with the same first values."""
+    count = len(new._fields)
     return jax.tree.map(
-        lambda x: new(*x) if isinstance(x, old) else x, tree, is_leaf=lambda x: isinstance(x, old)
+        lambda x: new(*x[:count]) if isinstance(x, old) else x,
+        tree,
+        is_leaf=lambda x: isinstance(x, old),
     )
 
 

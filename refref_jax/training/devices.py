@@ -6,6 +6,7 @@ summed over the devices. Without a mesh there is one device, and no such sum.
 """
 
 import contextlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +57,8 @@ def free_memory() -> int | None:
     """
     stats = jax.local_devices()[0].memory_stats()
     if stats is not None:
-        return int(stats.get("bytes_limit", 0)) - int(stats.get("bytes_in_use", 0)) or None
+        limit = int(stats.get("bytes_limit", 0))
+        return max(0, limit - int(stats.get("bytes_in_use", 0))) if limit else None
     system, own = _read_sizes("/proc/meminfo"), _read_sizes("/proc/self/status")
     if "MemAvailable" not in system or "VmData" not in own:
         return None
@@ -103,6 +105,22 @@ def any_process(flag: bool) -> bool:
     if jax.process_count() == 1:
         return flag
     return bool(np.any(multihost_utils.process_allgather(np.asarray(flag))))
+
+
+def in_all(check: Callable[[], None]) -> None:
+    """Runs a check, which must raise in all processes if it raises in one; others would wait.
+
+    Raises:
+      ValueError: if it fails in this or in another process.
+      OSError: if it fails so in this process.
+    """
+    failed: ValueError | OSError | None = None
+    try:
+        check()
+    except (ValueError, OSError) as error:
+        failed = error
+    if any_process(failed is not None):
+        raise failed or ValueError("Another process has stopped; its own message says why.")
 
 
 def as_in_the_first(tree: Any) -> Any:

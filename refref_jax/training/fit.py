@@ -274,8 +274,7 @@ def train(
                 f"{jax.process_count()}. Run it in one."
             )
         folder = scene_source.open_scene(scene or config.scene.path)
-        if devices.is_first():
-            run_folder.check_images(run, scene_folder.read_frames(folder, "train"))
+        devices.in_all(lambda: _check_images(run, folder))
         objects, log = checkpoint_io.load_scene(run), _Log(periods, progress, stop)
         if model.config.splats is not None:
             step = _train_splats(run, config, model.config, folder, checkpoints, log, mesh)
@@ -288,6 +287,11 @@ def train(
     if step < total:
         report(f"Stopped at {'iteration' if solved else 'step'} {step}.")
     return step == total
+
+
+def _check_images(run: Path, folder: Path) -> None:
+    if devices.is_first():
+        run_folder.check_images(run, scene_folder.read_frames(folder, "train"))
 
 
 class _Log(NamedTuple):

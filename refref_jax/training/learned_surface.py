@@ -27,7 +27,7 @@ from refref_jax.choices import Position
 from refref_jax.data.meshes import MeshPart
 from refref_jax.fields.base import RadianceConfig, SurfaceSums
 from refref_jax.fields.neus import SurfaceConfig
-from refref_jax.fields.tnsr import TnsrConfig
+from refref_jax.fields.tnsr import INDICES, TnsrConfig
 from refref_jax.geometry.bvh import LEAF_SIZE
 from refref_jax.geometry.cameras import Cameras
 from refref_jax.geometry.rays import Rays
@@ -135,8 +135,8 @@ def with_options(field: RadianceConfig, asked: FieldConfig) -> RadianceConfig:
         )
     if given:
         raise ValueError(
-            f"{' and '.join(given)} have no effect on field kind {field.kind}, whose light is not "
-            "bent by a learned surface. Leave them out, or use field=tnsr."
+            f"Without effect on field kind {field.kind}, whose light is not bent by a learned "
+            f"surface: {', '.join(given)}. Leave it out, or use field=tnsr."
         )
     return field
 
@@ -182,10 +182,13 @@ def usual(
     start = asked.surface_start or "ball"
     yield "by default", {"surface_start": start, "surface_index_from": "given"}
     yield f"surface_start={start}", {"straight_share": 0.5 if start == "ball" else 0.0}
-    if not parts:
-        yield "glass, as there are no meshes", {"surface_index": 1.5}
+    least, most = INDICES
+    bends = [part for part in parts if part.material.kind == "dielectric"]
+    clear = [part for part in bends if least <= part.index / ambient <= most]
+    if not clear:
+        yield "glass, as there is no mesh of glass or a liquid", {"surface_index": 1.5}
         return
-    largest = max(parts, key=lambda part: float(np.prod(np.ptp(part.vertices, axis=0))))
+    largest = max(clear, key=lambda part: float(np.prod(np.ptp(part.vertices, axis=0))))
     yield "the scene's largest mesh", {"surface_index": float(largest.index / ambient)}
 
 

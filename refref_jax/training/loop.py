@@ -375,7 +375,8 @@ def set_up(
         multiple=8 if runs_on_cpu() else MULTIPLE,
     )
     samples = model.samples + sum(each.samples for each in model.proposals)
-    _check_memory(batch, capacity * samples // (1 if mesh is None else mesh.size))
+    rendered = capacity * samples // (1 if mesh is None else mesh.size)
+    devices.in_all(lambda: _check_memory(batch, rendered))
     hit_fraction = float(found.hit_fraction)
     scene = devices.put_everywhere(scene, mesh=mesh)
     setup = Setup(config, model, settings, scene, sampler, capacity, hit_fraction, mesh=mesh)
@@ -396,8 +397,8 @@ def _check_memory(batch: int, samples: int) -> None:
     if free is not None and least > free:
         raise ValueError(
             f"A step of batch={batch} rays takes at least {least / 2**30:.1f} GiB, but "
-            f"{free / 2**30:.1f} GiB of memory are free. Lower batch to {batch * free // least} "
-            "or less, or samples_per_ray."
+            f"{free / 2**30:.1f} GiB of memory are free. Lower batch to "
+            f"{max(1, batch * free // least)} or less, or samples_per_ray."
         )
 
 

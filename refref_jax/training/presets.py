@@ -266,8 +266,8 @@ def usual_paths(config: TrainConfig, parts: int) -> tuple[Paths, str]:
     if registry.KINDS[field].deform is not None:
         if given.name not in (None, "straight") or given.max_bends:
             raise ValueError(
-                f"field={field} bends straight rays, not those of paths={given.name}. Use "
-                "paths=straight, or field=zipnerf."
+                f"field={field} bends straight rays, not those of paths={given.name or 'tree'}. "
+                "Use paths=straight, or field=zipnerf."
             )
         return "straight", f"field={field} bends straight rays"
     return ("tree", "there are meshes") if parts else ("straight", "there are no meshes")
@@ -375,10 +375,15 @@ def losses_of(model: ModelConfig, asked: LossConfig) -> dict[str, Any]:
       ValueError: if they have weights for a surface or a deformation that the field does not have.
     """
     bent = asked.deformation_weights
-    if bent and (len(bent) != 3 or not registry.has_deformation(model.field)):
+    if bent and not registry.has_deformation(model.field):
         raise ValueError(
-            f"deformation_weights has {len(bent)} numbers for field kind {model.field.kind}. Give "
-            "three to field=raydef, of bends, turns and size, such as 3e-3,1e-3,1e-4, or none."
+            f"deformation_weights has no effect on field kind {model.field.kind}. Leave it out, or "
+            "use field=raydef or raydef_polyline."
+        )
+    if bent and len(bent) != 3:
+        raise ValueError(
+            f"deformation_weights has {len(bent)} numbers. Give three, of bends, turns and size, "
+            "such as 3e-3,1e-3,1e-4."
         )
     for name in _SURFACE:
         weight = getattr(asked, name)

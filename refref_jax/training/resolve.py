@@ -233,7 +233,7 @@ def _resolve_paths(
             f"There are no meshes that could bend light for paths={config.paths.name}."
             " Add .ply files of the objects to the scene's folder meshes, or use paths=straight."
         )
-    if config.paths.name is None:
+    if config.paths.name is None and not bends:
         meshes.refuse_missing(facts.parts, facts.origins)
     name, why = presets.usual_paths(config, found.parts)
     config = _decide(config, reasons, why, paths=name)

@@ -38,7 +38,7 @@ from refref_jax.render.checkpoint_io import (
     open_checkpoints,
     restore,
 )
-from refref_jax.training import config_files, presets
+from refref_jax.training import config_files, devices, presets
 from refref_jax.training.config import TrainConfig, options_of
 from refref_jax.training.config_files import CONFIG
 from refref_jax.training.loop import TrainState
@@ -90,7 +90,7 @@ class Checkpoints:
             PARAMS_ITEM: ocp.args.StandardSave(state.params),
             TRAINING_ITEM: ocp.args.StandardSave(_training_item(state)),
         }
-        _check_space(self._run, state)
+        devices.in_all(lambda: _check_space(self._run, state))
         self._manager.save(step, args=ocp.args.Composite(**items), force=True)
         self._manager.wait_until_finished()
         if jax.process_index() == 0:
@@ -277,8 +277,9 @@ def check_images(run: Path, frames: Frames) -> None:
     masks = zip(frames.names, frames.masks or (), strict=frames.masks is not None)
     files |= {f"mask of {name}": path for name, path in masks}
     found = {name: checkpoint_io.checksum(path) for name, path in files.items()}
-    cameras = np.asarray([*frames.cameras.poses.ravel(), frames.cameras.focal], np.float64)
-    found["cameras"] = zlib.crc32(cameras.tobytes())
+    cameras = [*frames.cameras.poses.ravel(), frames.cameras.focal]
+    # Nine digits: the last ones of a focal length depend on the machine.
+    found["cameras"] = zlib.crc32(" ".join(f"{float(x):.9g}" for x in cameras).encode())
     path = run / _IMAGES
     if not path.is_file():
         with atomic_files.written_file(path) as draft:
@@ -289,9 +290,9 @@ def check_images(run: Path, frames: Frames) -> None:
     except ValueError as error:
         raise ValueError(f"{path} is damaged ({error}). Remove it to trust the images.") from error
     if known != found:
-        names = [name for name in found if name not in known or known[name] != found[name]]
+        names = [name for name in known | found if known.get(name) != found.get(name)]
         raise ValueError(
-            f"{', '.join(names[:3]) or 'The number'} of the training images in "
+            f"{', '.join(names[:3])} of the training images in "
             f"{frames.images[0].parent} changed since {run} began. Restore the scene, train in "
             f"another folder, or remove {path} to continue with the new ones."
         )

@@ -79,7 +79,7 @@ def test_commands_name_the_kind_of_field(trained, tmp_path):
         ({"deformation_weights": (1.0, -2.0, 0.0)}, r"weight or blur of the losses is -2\.0"),
         (
             {"field": "zipnerf", "deformation_weights": (1.0, 1.0, 1.0)},
-            r"deformation_weights has 3 numbers for field kind zipnerf",
+            r"deformation_weights has no effect on field kind zipnerf",
         ),
         ({"field": "raydeff"}, r"field is 'raydeff'.*raydef"),
     ],

@@ -2,6 +2,7 @@
 
 import functools
 import json
+import shutil
 
 import jax
 import jax.numpy as jnp
@@ -176,7 +177,7 @@ def test_options_follow_from_the_scene_and_the_start():
         ({"surface_index": 0.5}, r"index of a surface is 0\.5"),
         ({"background": "unbounded"}, r"field=tnsr has a surface in a ball of the world"),
         ({"far_field": "backdrop"}, r"cannot model a surface \(field=neus, unisurf or tnsr\)"),
-        ({"field": "neus", "surface_index": 1.5}, r"surface_index have no effect on field kind"),
+        ({"field": "neus", "surface_index": 1.5}, r"field kind neus.*surface_index"),
         ({"field": "zipnerf", "surface_start": "meshes"}, r"surface_start have no effect on"),
     ],
 )
@@ -192,3 +193,31 @@ def test_meshes_are_needed_to_begin_from_them():
         learned_surface.check(config, 0)
     found = dict(learned_surface.usual(config.model, [], 1.0))
     assert {"surface_index": 1.5} in found.values()
+
+
+@pytest.mark.parametrize("index", [1.01, 1.5, 3.0])
+def test_a_learned_index_returns_from_its_bounds(index):
+    config = fit.prepare(
+        _config(surface_index=index, surface_index_from="learned"), report=lambda line: None
+    )[0].model.config.field
+    params = tnsr.init_radiance(jax.random.key(0), config)
+
+    def found(change):
+        return tnsr.index_of(params._replace(index_change=change), config)
+
+    least, most = tnsr.INDICES
+    assert found(jnp.float32(0.0)) == pytest.approx(index, abs=3e-3)
+    for change in (-40.0, -1.0, 0.0, 1.0, 40.0):
+        value, slope_ = jax.value_and_grad(found)(jnp.float32(change))
+        assert least <= value <= most and np.isfinite(slope_) and slope_ >= 0.0
+    assert jax.grad(found)(jnp.float32(2.0)) > 0.0
+
+
+def test_a_surface_is_learned_where_described_meshes_are_gone(tmp_path):
+    scene = tmp_path / "cube_smcvx_ball"
+    shutil.copytree(_SCENE, scene, ignore=shutil.ignore_patterns("*.ply"))
+    lines = []
+    config = _config().override(scene=str(scene))
+    resolved, _ = fit.prepare(config, report=lines.append)
+    assert resolved.config.paths.max_bends == learned_surface.BENDS
+    assert not any("straight" in line for line in lines if line.startswith("note"))

@@ -3,6 +3,7 @@ import functools
 import itertools
 import json
 import shutil
+import types
 from typing import Any, NamedTuple
 
 import jax
@@ -444,3 +445,29 @@ def test_steps_that_cannot_fit_into_memory_are_refused_with_the_batch_that_could
         _setup()
     monkeypatch.setattr(loop.devices, "free_memory", lambda: None)
     assert _setup().capacity > 0
+
+
+@pytest.mark.parametrize(
+    ("stats", "free"),
+    [
+        ({"bytes_in_use": 7}, None),
+        ({"bytes_limit": 10, "bytes_in_use": 7}, 3),
+        ({"bytes_limit": 10, "bytes_in_use": 12}, 0),
+    ],
+)
+def test_memory_of_a_device_is_unknown_without_its_limit(stats, free, monkeypatch):
+    device = types.SimpleNamespace(memory_stats=lambda: stats)
+    monkeypatch.setattr(jax, "local_devices", lambda: [device])
+    assert loop.devices.free_memory() == free
+
+
+def test_a_check_that_fails_elsewhere_fails_here(monkeypatch):
+    def broken():
+        raise OSError("full")
+
+    with pytest.raises(OSError, match="full"):
+        loop.devices.in_all(broken)
+    loop.devices.in_all(lambda: None)
+    monkeypatch.setattr(loop.devices, "any_process", lambda flag: True)
+    with pytest.raises(ValueError, match="Another process has stopped"):
+        loop.devices.in_all(lambda: None)

@@ -84,7 +84,7 @@ def test_a_placement_is_applied_as_its_file_says(tmp_path):
 def test_rough_objects_and_none_are_refused():
     ball = scenes.ball(1.0, subdivisions=1)
     rough = ball._replace(material=ball.material._replace(roughness=0.2))
-    with pytest.raises(SceneError, match="is rough, or not a dielectric"):
+    with pytest.raises(SceneError, match="is rough or dispersive, or not a dielectric"):
         alignment.placed_object([rough])
     with pytest.raises(SceneError, match="no meshes to align"):
         alignment.placed_object([])
@@ -174,3 +174,12 @@ def test_creases_of_an_open_mesh_are_refused():
     views = Views(bodies.masks_of(bodies.ball, cameras), cameras)
     with pytest.raises(ReconstructionError, match="not closed"):
         fit_placement(_placed(mesh), Outlines(views, creased=True))
+
+
+def test_an_object_that_is_elsewhere_is_refused(tmp_path, monkeypatch):
+    scene = write_scene(tmp_path / "cube_smcvx_ball", size=64)
+    monkeypatch.setattr(index_stage, "learn_backdrop", None)  # would raise
+    for wrong in ({"shift": (30.0, 0.0, 0.0)}, {"size": 0.02}):
+        parts = [_perturbed(part, **wrong) for part in meshes.read_meshes(scene)]
+        with pytest.raises(ValueError, match="The object cannot be aligned"):
+            alignment.align(scene, parts, tmp_path, _OWN, seed=0)
