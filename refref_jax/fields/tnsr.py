@@ -113,7 +113,7 @@ def opaque(config: SurfaceConfig) -> SurfaceConfig:
 def index_of(params: NeusParams, config: TnsrConfig) -> Float[Array, ""]:
     """Returns the index of refraction inside the surface, relative to that outside.
 
-    A learned one changes by `neus.PACE` per unit of its parameter at first, and approaches its
+    A learned one changes by at most `neus.PACE` per unit of its parameter, and approaches its
     bounds smoothly: where it were cut off, it would never return.
     """
     index = jnp.asarray(config.index, jnp.float32)
@@ -121,7 +121,7 @@ def index_of(params: NeusParams, config: TnsrConfig) -> Float[Array, ""]:
         return index
     least, most = INDICES
     share = min(max((config.index - least) / (most - least), 1e-3), 1.0 - 1e-3)
-    pace = neus.PACE / ((most - least) * share * (1.0 - share))
+    pace = 4.0 * neus.PACE / (most - least)  # a sigmoid has at most a slope of 1/4
     moved = math.log(share / (1.0 - share)) + pace * params.index_change
     return least + (most - least) * jax.nn.sigmoid(moved)
 

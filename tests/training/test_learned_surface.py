@@ -176,9 +176,9 @@ def test_options_follow_from_the_scene_and_the_start():
         ({"straight_share": 1.0}, r"share of steps with straight rays is 1\.0"),
         ({"surface_index": 0.5}, r"index of a surface is 0\.5"),
         ({"background": "unbounded"}, r"field=tnsr has a surface in a ball of the world"),
-        ({"far_field": "backdrop"}, r"cannot model a surface \(field=neus, unisurf or tnsr\)"),
+        ({"far_field": "backdrop"}, r"cannot model a surface or deformation \(field=tnsr\)"),
         ({"field": "neus", "surface_index": 1.5}, r"field kind neus.*surface_index"),
-        ({"field": "zipnerf", "surface_start": "meshes"}, r"surface_start have no effect on"),
+        ({"field": "zipnerf", "surface_start": "meshes"}, r"Without effect on field kind zipnerf.*surface_start"),
     ],
 )
 def test_wrong_options_are_refused_before_anything_is_compiled(changes, message, monkeypatch):
