@@ -178,7 +178,7 @@ def test_options_follow_from_the_scene_and_the_start():
         ({"background": "unbounded"}, r"field=tnsr has a surface in a ball of the world"),
         ({"far_field": "backdrop"}, r"cannot model a surface or deformation \(field=tnsr\)"),
         ({"field": "neus", "surface_index": 1.5}, r"field kind neus.*surface_index"),
-        ({"field": "zipnerf", "surface_start": "meshes"}, r"Without effect on field kind zipnerf.*surface_start"),
+        ({"field": "zipnerf", "surface_start": "meshes"}, r"kind zipnerf.*: surface_start"),
     ],
 )
 def test_wrong_options_are_refused_before_anything_is_compiled(changes, message, monkeypatch):
