@@ -25,10 +25,9 @@ from typing import NamedTuple
 import numpy as np
 from absl import app, flags
 
-from experiments.cli import subprocesses
 from experiments.r3f import object_source, records
 from experiments.r3f.records import Reconstruction
-from experiments.runs import measured_runs
+from experiments.runs import measured_runs, subprocesses
 from refref_jax.data import meshes
 from refref_jax.data.scene_assembly import shaded_mesh
 from refref_jax.reconstruct.mesh_distance import Distance, compare_meshes

@@ -21,8 +21,8 @@ import numpy as np
 from absl import app, flags
 from scipy.ndimage import binary_dilation
 
-from experiments.cli import subprocesses
 from experiments.r3f import index_stage, light_stage, object_source, records
+from experiments.runs import subprocesses
 from refref_jax.data import meshes
 from refref_jax.data.scene_assembly import shaded_mesh
 from refref_jax.geometry.triangle_meshes import Mesh

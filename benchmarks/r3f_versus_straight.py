@@ -20,10 +20,9 @@ from typing import NamedTuple
 
 from absl import app, flags
 
-from experiments.cli import subprocesses
 from experiments.r3f import object_source, records
 from experiments.r3f.records import IndexFacts
-from experiments.runs import measured_runs
+from experiments.runs import measured_runs, subprocesses
 from experiments.runs.measured_runs import Evaluation
 from refref_jax.data import meshes, scene_names
 from refref_jax.training.presets import PRESETS

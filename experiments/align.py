@@ -36,10 +36,17 @@ cli_flags.allow_outside()
 _OUT = cli_flags.out("Folder to write to.")
 _OVERWRITE = cli_flags.overwrite("an earlier alignment")
 
+_WRITES = (
+    *("placement.json", "reconstruction.json", "errors.png"),
+    *("background", "light", "geometry"),
+)
+
 
 def main() -> None:
     """Aligns the object of a scene."""
     out, indices = Path(_OUT.value), refraction_indices.parse_named(_IOR.value)
+    place = {"module": __name__, "writes": _WRITES, "overwrite": _OVERWRITE.value}
+    outputs.replaceable(out, **place)
     cli_scenes.check(_SCENE.value)
     scene = cli_scenes.opened(_SCENE.value)
     told = scene_properties.read(scene, overlay=_PROPERTIES.value)
@@ -59,7 +66,6 @@ def main() -> None:
     space, radius, centre = chain.bounds_of(
         scene, _PROPERTIES.value or "", space=_SPACE.chosen(), radius=_SPACE.radius.value
     )
-    place = {"module": __name__, "writes": alignment.WRITES, "overwrite": _OVERWRITE.value}
     with outputs.fresh(out, **place) as draft:
         background = alignment.Background(space, radius, centre)
         facts = alignment.align(scene, parts, draft, background, seed=_SEED.value)
@@ -72,4 +78,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    app.run(main)
+    app.run(main, again="repeat the command to align again; nothing was written.")

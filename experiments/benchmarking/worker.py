@@ -34,11 +34,10 @@ from experiments.benchmarking.methods import RECONSTRUCTION
 from experiments.benchmarking.plan import SPLIT, Job, Skipped
 from experiments.benchmarking.results import Costs, Image, Record, Truth, View, number
 from experiments.benchmarking.settings import Benchmark
-from experiments.cli import subprocesses
 from experiments.cli.progress import ProgressBar
-from experiments.cli.subprocesses import RunFailedError
 from experiments.r3f import records
-from experiments.runs import measured_runs, renderings
+from experiments.runs import measured_runs, renderings, subprocesses
+from experiments.runs.subprocesses import RunFailedError
 from refref_jax import atomic_files, configuration
 from refref_jax.data import scene_folder
 

@@ -42,9 +42,6 @@ from refref_jax.reconstruct.shapes import LARGEST_STEP, LARGEST_TURN, Posed
 
 PLACEMENT, FIGURE = "placement.json", "errors.png"
 
-WRITES = (PLACEMENT, records.FILE, FIGURE, "background", light_stage.FOLDER, geometry_stage.FOLDER)
-"""Names of what is written."""
-
 # Steps of the fit of a placement, and the change, relative to the scales of the unknowns, that ends
 # it; standard deviations of its prior: radians, shares of the diameter, logarithm of the size.
 _PLACEMENT_ROUNDS, _PLACED = 30, 1e-4

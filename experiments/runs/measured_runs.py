@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.cli import subprocesses
+from experiments.runs import subprocesses
 from refref_jax import atomic_files, configuration
 from refref_jax.data import scene_folder
 from refref_jax.render import checkpoint_io

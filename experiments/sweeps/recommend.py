@@ -12,9 +12,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from experiments.cli import app
-from experiments.cli.subprocesses import RunFailedError
 from experiments.runs import measured_runs
 from experiments.runs.measured_runs import Training
+from experiments.runs.subprocesses import RunFailedError
 from experiments.sweeps import table
 from experiments.sweeps.options import OF_EVALUATION
 from experiments.sweeps.points import BASE

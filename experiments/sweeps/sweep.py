@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from experiments.cli.progress import ProgressBar
-from experiments.cli.subprocesses import RunFailedError
 from experiments.runs import measured_runs
+from experiments.runs.subprocesses import RunFailedError
 from experiments.sweeps import report, table
 from experiments.sweeps.options import OF_EVALUATION
 from experiments.sweeps.points import BASE, Point

@@ -40,6 +40,7 @@ _IN_THE_WAY = {
     "glass_figures": (["--scene=x", "--out=FOLDER"], "glass_fan.jpg"),
     "metrics": (["x", "y", "--out=FOLDER/metrics.json"], "metrics.json"),
     "export": (["--run=x", "--what=mesh", "--out=FOLDER/a.ply"], "a.ply"),
+    "align": (["--scene=x", "--out=FOLDER"], "placement.json"),
     "accelerator_check": (["--out=FOLDER"], "report.md"),
     "convert_lpips": (["--alexnet=x", "--lpips=x", "--out=FOLDER/a.npz"], "a.npz"),
     "dataset.check": (["FOLDER"], "check.html"),

@@ -7,9 +7,8 @@ import subprocess
 import imageio.v3 as iio
 import pytest
 
-from experiments.cli import subprocesses
-from experiments.cli.subprocesses import RunFailedError
-from experiments.runs import measured_runs
+from experiments.runs import measured_runs, subprocesses
+from experiments.runs.subprocesses import RunFailedError
 from experiments.sweeps import far_fields, report, sweep, table
 from experiments.sweeps import options as sweep_options
 from experiments.sweeps import points as trade_points
@@ -367,7 +366,11 @@ else:
     ("text", "status", "told"),
     [
         ("$ python -m experiments.train --scene=mirror\nCompiling\n", 1, "Compiling"),
-        ("$ python -m experiments.train --scene=mirror\n", -9, "killed by SIGKILL"),
+        (
+            "$ python -m experiments.train --scene=mirror\n",
+            -9,
+            "killed by SIGKILL, as when memory runs out: lower --batch",
+        ),
         ("ValueError: no\nbye\n", 1, "ValueError: no"),
         ("", 3, "ended with status 3, and printed nothing"),
     ],

@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 
 from experiments.benchmarking import worker
-from experiments.cli import subprocesses
+from experiments.runs import subprocesses
 
 _REAL = subprocesses.command_line
 _STAND_IN = Path(__file__).with_name("stand_in.py")

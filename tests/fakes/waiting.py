@@ -9,7 +9,8 @@ import sys
 import threading
 from pathlib import Path
 
-from experiments.cli import app, subprocesses
+from experiments.cli import app
+from experiments.runs import subprocesses
 
 
 def _command_line(name, options):

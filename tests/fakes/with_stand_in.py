@@ -14,7 +14,8 @@ import sys
 from absl import flags
 
 from experiments import benchmark
-from experiments.cli import app, subprocesses
+from experiments.cli import app
+from experiments.runs import subprocesses
 from tests.fakes.job_commands import stand_in_line
 
 

@@ -57,16 +57,16 @@ def test_without_a_rule_parts_are_nested(scene):
 
 
 def test_options_override_scene_json_and_say_so(scene):
-    background = {"type": "sphere", "radius": 6.0}
+    background = {"type": "sphere", "radius": 60.0}
     parts = [{**_PARTS[0], "index": 1.6}, _PARTS[1]]
     place = scene(rule="facing", background=background, parts=parts)
-    given = {"rule": "nested", "radius": 7.0, "ior": {"glass": 1.7}}
+    given = {"rule": "nested", "radius": 70.0, "ior": {"glass": 1.7}}
     made, outside, lines = _prepare(place, **given)
-    assert outside == [1.0, np.float32(1.7)] and made.config.scene.radius == 7.0
+    assert outside == [1.0, np.float32(1.7)] and made.config.scene.radius == 70.0
     assert made.reasons["rule"] == made.reasons["radius"] == "given"
     assert lines[-4:-1] == [
         "note: rule=nested overrides scene.json: facing.",
-        "note: radius=7 overrides scene.json: 6.",
+        "note: radius=70 overrides scene.json: 60.",
         "note: index=1.7 of cup_glass overrides scene.json: 1.6.",
     ]
     _, _, lines = _prepare(place, background="bounded")
@@ -80,12 +80,12 @@ def test_the_ambient_medium_of_scene_json_is_around_all_parts(scene):
 
 def test_an_overlay_decides_before_scene_json(scene, tmp_path):
     overlay = tmp_path / "mine.json"
-    overlay.write_text('{"rule": "facing", "background": {"type": "sphere", "radius": 5}}')
-    place = scene(rule="nested", background={"type": "cube", "half_extent": 7.3})
+    overlay.write_text('{"rule": "facing", "background": {"type": "sphere", "radius": 50}}')
+    place = scene(rule="nested", background={"type": "cube", "half_extent": 73})
     made, outside, _ = _prepare(place, properties=str(overlay))
     assert outside == [1.0, 1.0] and made.config.scene.properties == str(overlay.resolve())
     found = [made.config.get(name) for name in ("rule", "background", "radius")]
-    assert found == ["facing", "spherical", 5.0]
+    assert found == ["facing", "spherical", 50.0]
     assert made.reasons["rule"] == made.reasons["radius"] == "mine.json"
     assert _prepare(place)[0].config.scene.rule == "nested"
     overlay.write_text('{"rle": "facing"}')

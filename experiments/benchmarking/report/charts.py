@@ -51,7 +51,7 @@ def look(method: str) -> Line:
     group = METHODS[method].group
     place = [name for name in METHODS if METHODS[name].group == group].index(method)
     if group not in FULL:
-        return Line(place % len(COLOURS), _DASHES[1])
+        return Line(place % len(COLOURS), _DASHES[1 + place // len(COLOURS)])
     full = look(FULL[group])
     free = [i for i in range(len(COLOURS)) if i != full.colour]
     return Line(free[place % len(free)], _DASHES[place // len(free)])

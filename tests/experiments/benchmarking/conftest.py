@@ -1,6 +1,6 @@
 import pytest
 
-from experiments.cli import subprocesses
+from experiments.runs import subprocesses
 from tests.factories.made_benchmark import write_scene
 from tests.fakes.job_commands import stand_in_line
 from tests.fakes.serving import Server

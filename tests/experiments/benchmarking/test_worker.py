@@ -14,8 +14,8 @@ from experiments.benchmarking import methods, plan, results, settings, summary, 
 from experiments.benchmarking.methods import METHODS, RECONSTRUCTION
 from experiments.benchmarking.plan import Job
 from experiments.benchmarking.worker import LocalEngine
-from experiments.cli import subprocesses
-from experiments.cli.subprocesses import RunFailedError
+from experiments.runs import subprocesses
+from experiments.runs.subprocesses import RunFailedError
 from refref_jax import atomic_files
 from tests.factories.made_benchmark import SETTINGS, made_record, write_scene
 
