@@ -91,16 +91,20 @@ def test_an_index_is_learned_within_bounds():
     np.testing.assert_allclose(tnsr.index_of(params, given), 1.4, rtol=1e-6)
     params = registry.init_radiance(jax.random.key(0), learned)
     move = lambda change: tnsr.index_of(params._replace(index_change=jnp.float32(change)), learned)
-    np.testing.assert_allclose([move(0.0), move(1.0)], [1.4, 1.4 + neus.PACE], rtol=1e-6)
+    least, most = tnsr.INDICES
+    share = (1.4 - least) / (most - least)
+    pace = 4.0 * share * (1.0 - share) * neus.PACE  # the slope of the sigmoid, at most 1
+    np.testing.assert_allclose(move(0.0), 1.4, rtol=1e-6)
+    np.testing.assert_allclose((move(0.1) - move(-0.1)) / 0.2, pace, rtol=1e-3)
     np.testing.assert_allclose([move(-1e3), move(1e3)], tnsr.INDICES, rtol=1e-6)
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"index": 1.0}, r"index of a surface is 1\.0\. Give a number from 1\.01 to 3"),
+        ({"index": 1.0}, r"index of a surface is 1\.0\. Give surface_index a number"),
         ({"index": 7.0}, r"index of a surface is 7\.0"),
-        ({"straight": 1.0}, r"share of steps with straight rays is 1\.0\. Give 0 or more, below 1"),
+        ({"straight": 1.0}, r"share of steps with straight rays is 1\.0\. Give straight_share 0"),
     ],
 )
 def test_wrong_shapes_are_refused(changes, message):
