@@ -438,19 +438,7 @@ def _write_reconstruction(
     outer, first = placed[order[0]], parts[order[0]]
     meshes.write_mesh(out / geometry_stage.FOLDER / listed[0].mesh, *outer)
     views = light_stage.read_views(scene)
-    geometry = records.GeometryFacts(
-        mesh=listed[0].mesh,
-        masks=len(views.masks),
-        width=views.cameras.width,
-        height=views.cameras.height,
-        vertices=len(outer.vertices),
-        faces=len(outer.faces),
-        volume=volume(outer.vertices, outer.faces),
-        diameter=diameter(outer.vertices),
-        stages=("aligned",),
-        refused=(),
-        warnings=(),
-    )
+    geometry = geometry_stage.describe(listed[0].mesh, outer, views, stages=("aligned",))
     light = records.LightFacts(
         kept=True,
         index=first.index,

@@ -80,15 +80,10 @@ def run(scene: Path, out: Path, config: ReconstructionConfig) -> GeometryFacts:
     name = f"{_object(scene)}_{MATERIAL}.ply"
     with atomic_files.written_folder(out / FOLDER) as folder:
         meshes.write_mesh(folder / name, *mesh)
-    return GeometryFacts(
-        mesh=name,
-        masks=len(views.masks),
-        width=frames.cameras.width,
-        height=frames.cameras.height,
-        vertices=len(mesh.vertices),
-        faces=len(mesh.faces),
-        volume=volume(mesh.vertices, mesh.faces),
-        diameter=diameter(mesh.vertices),
+    return describe(
+        name,
+        mesh,
+        views,
         stages=tuple(
             stage.name
             for before, stage in zip(befores, refined, strict=False)
@@ -96,6 +91,40 @@ def run(scene: Path, out: Path, config: ReconstructionConfig) -> GeometryFacts:
         ),
         refused=tuple(f"{stage.name}: {stage.refused}" for stage in refined if stage.refused),
         warnings=about_masks(mesh, views, names, outliers=config.outliers),
+    )
+
+
+def describe(
+    name: str,
+    mesh: Mesh,
+    views: Views,
+    *,
+    stages: tuple[str, ...],
+    refused: tuple[str, ...] = (),
+    warnings: tuple[str, ...] = (),
+) -> GeometryFacts:
+    """Returns the facts of a surface.
+
+    Args:
+      name: name of its file.
+      mesh: the surface.
+      views: masks of the object.
+      stages: names of the stages that changed it.
+      refused: skipped stages, and the reasons.
+      warnings: warnings about masks.
+    """
+    return GeometryFacts(
+        mesh=name,
+        masks=len(views.masks),
+        width=views.cameras.width,
+        height=views.cameras.height,
+        vertices=len(mesh.vertices),
+        faces=len(mesh.faces),
+        volume=volume(mesh.vertices, mesh.faces),
+        diameter=diameter(mesh.vertices),
+        stages=stages,
+        refused=refused,
+        warnings=warnings,
     )
 
 
