@@ -77,6 +77,7 @@ class EvaluatedView(NamedTuple):
       target: true image, 8-bit sRGB.
       rendering: rendered image.
       measures: metrics of the image, and the `seconds` that rendering took.
+      mask: mask of the object, if there is one.
     """
 
     name: str
@@ -85,6 +86,7 @@ class EvaluatedView(NamedTuple):
     target: UInt8[np.ndarray, "h w 3"]
     rendering: Rendering
     measures: Measured
+    mask: Bool[np.ndarray, "h w"] | None = None
 
 
 class Evaluation(NamedTuple):
@@ -152,8 +154,8 @@ def evaluate(
         measured["seconds"] = seconds
         per_image.append({"name": name, **measured})
         if on_view is not None:
-            target = truth.images[i]
-            on_view(EvaluatedView(name, place, len(chosen), target, seen, measured))
+            target, mask = truth.images[i], None if truth.masks is None else truth.masks[i]
+            on_view(EvaluatedView(name, place, len(chosen), target, seen, measured, mask))
         if progress is not None:
             progress(place + 1, len(chosen), f"{name}  PSNR {measured['psnr']:.2f}")
     results = {key: mean_of(per_image, key) for key in per_image[0] if key != "name"}
