@@ -33,6 +33,9 @@ _SINGULAR = 1e8
 _SHIFTED, _GROWN, _MOVED = 0.05, 0.1, 0.1
 _CERTAIN = 5.0
 
+# Share of the larger of growth and shift inside the outline below which the other one is not told.
+_LESSER = 0.25
+
 # Least residual along the outline that is told, sRGB, and its ratio to that inside.
 _ROUGH, _ROUGHER = 0.1, 2.0
 
@@ -164,13 +167,13 @@ def tell(views: Sequence[Residuals]) -> tuple[str, ...]:
     if told:
         return tuple(told)
     grown, moved = _typical(inside, _growth), _typical(inside, _shift)
-    if abs(grown) > _SHIFTED:
+    if abs(grown) > max(_SHIFTED, _LESSER * moved):
         told.append(
             f"inside the outline, what is refracted is {'larger' if grown > 0.0 else 'smaller'} "
             f"than it is rendered, by {abs(grown):.2f} pixels: index of refraction or size of the "
             "object. Find them with experiments.reconstruct or experiments.align."
         )
-    if moved > _MOVED:
+    if moved > max(_MOVED, _LESSER * abs(grown)):
         told.append(
             f"inside the outline, what is refracted is shifted by {moved:.2f} pixels: place, "
             "direction or shape of the object. Align its mesh with experiments.align."
