@@ -92,6 +92,7 @@ FieldName = Literal[
     "tnsr",
     "raydef",
     "raydef_polyline",
+    "rosenerf",
     "splats",
 ]
 """Field kinds, the default first (`fields.registry`), and Gaussian splats, which have no field."""

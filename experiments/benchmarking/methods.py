@@ -133,6 +133,15 @@ _ALL = (
         (),
     ),
     Method(
+        "rosenerf",
+        "RoseNeRF (our fields)",
+        "baseline",
+        (*_STRAIGHT, "--field=rosenerf"),
+        (),
+        False,
+        "RoseNeRF",
+    ),
+    Method(
         "splats",
         "Splats (MCMC)",
         "baseline",

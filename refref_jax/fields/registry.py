@@ -8,7 +8,7 @@ from collections.abc import Mapping
 
 from jaxtyping import Array, Float
 
-from refref_jax.fields import msnerf, nerfacto, neus, raydef, tnsr, zipnerf
+from refref_jax.fields import msnerf, nerfacto, neus, raydef, rosenerf, tnsr, zipnerf
 from refref_jax.fields.base import (
     Blend,
     DensityConfig,
@@ -31,6 +31,7 @@ KINDS: dict[str, FieldKind] = {
     "tnsr": tnsr.KIND,
     "raydef": raydef.KIND,
     "raydef_polyline": raydef.POLYLINE,
+    "rosenerf": rosenerf.KIND,
 }
 
 USUAL = "zipnerf"
@@ -106,6 +107,11 @@ def knots(config: RadianceConfig) -> int:
     A field with a deformation and without knots moves every sample.
     """
     return config.knots if isinstance(config, raydef.RaydefPolylineConfig) else 0
+
+
+def has_second_ray(config: RadianceConfig) -> bool:
+    """Returns whether a deformation makes a second ray, which is sampled beside the first."""
+    return isinstance(config, rosenerf.RosenerfConfig)
 
 
 def init_density(key: Array, config: DensityConfig) -> Params:

@@ -163,7 +163,8 @@ def move(
 
     Returns:
       The moved multisamples, the turned points (whose positions are those before), and the bent
-      ray, with equal weights.
+      ray, with equal weights. A second ray adds its multisamples to those of the ray, whose points
+      stay as they are.
     """
     cells = jnp.mean(gaussians.positions, axis=-2)
     offsets = jax.vmap(registry.deform, in_axes=(None, None, 0, 0, None))(
@@ -177,7 +178,11 @@ def move(
     shifts = radii * (jnp.mean(moved, axis=-2) - cells)
     even = jnp.full_like(places, 1.0 / places.size)
     bent = BentRay(shifts, places, points.direction, turned, even)
-    return gaussians._replace(positions=moved), points._replace(direction=turned), bent
+    second = gaussians._replace(positions=moved)
+    if registry.has_second_ray(field):
+        pair = (jnp.concatenate(both, axis=1) for both in zip(gaussians, second, strict=True))
+        return Gaussians(*pair), points, bent
+    return second, points._replace(direction=turned), bent
 
 
 def bend(

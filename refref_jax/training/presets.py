@@ -378,7 +378,7 @@ def losses_of(model: ModelConfig, asked: LossConfig) -> dict[str, Any]:
     if bent and not registry.has_deformation(model.field):
         raise ValueError(
             f"deformation_weights has no effect on field kind {model.field.kind}. Leave it out, or "
-            "use field=raydef or raydef_polyline."
+            "use field=raydef, raydef_polyline or rosenerf."
         )
     if bent and len(bent) != 3:
         raise ValueError(

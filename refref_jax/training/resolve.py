@@ -362,7 +362,7 @@ def _resolve_far_field(
 
 def _needs_of_a_field(config: TrainConfig, facts: SceneFacts) -> list[str]:
     """Returns what a backdrop cannot model, even with a field in front of it."""
-    field, bent = config.model.field, ("raydef", "raydef_polyline")
+    field, bent = config.model.field, ("raydef", "raydef_polyline", "rosenerf")
     needs = {
         "Gaussian splats (field=splats)": field == presets.SPLATS,
         "straight rays (paths=straight)": facts.analysis.parts > 0 and not config.paths.max_bends,

@@ -1,5 +1,6 @@
 """Arrays as the library takes them."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -18,3 +19,9 @@ def unit(vectors):
     """Returns vectors of length one, in double precision."""
     vectors = np.asarray(vectors, np.float64)
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def drawn(shapes, *, scale):
+    """Returns normally distributed arrays of given shapes, always the same, in single precision."""
+    rng = np.random.default_rng(1)
+    return jax.tree.map(lambda x: single(scale * rng.normal(size=x.shape)), shapes)

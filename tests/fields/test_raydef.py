@@ -10,6 +10,7 @@ import pytest
 from refref_jax.fields import hash_grid, raydef, registry, zipnerf
 from refref_jax.fields.hash_grid import HashGridConfig
 from refref_jax.sampling.polylines import Gaussians
+from tests.factories import arrays
 from tests.laws import gradients
 
 _GRID = HashGridConfig(levels=2, base_res=3, max_res=10, hashmap_size=256, features=2)
@@ -28,9 +29,7 @@ def _direction():
 
 def _trained(config=_CONFIG, scale=0.6):
     shapes = jax.eval_shape(lambda: raydef.init_radiance(jax.random.key(0), config))
-    rng = np.random.default_rng(1)
-    made = lambda x: jnp.asarray(scale * rng.normal(size=x.shape), jnp.float32)
-    return jax.tree.map(made, shapes)
+    return arrays.drawn(shapes, scale=scale)
 
 
 @pytest.mark.parametrize("depth", [1, 2, 6])

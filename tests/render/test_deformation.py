@@ -22,7 +22,7 @@ from refref_jax.render import Model, learned_media, render_ray, volume_rendering
 from refref_jax.render.model import ProposalConfig, init_params, look_up
 from refref_jax.render.volume_rendering import Jitter
 from refref_jax.sampling import polylines, scene_bounds
-from tests.factories import made_paths, scenes
+from tests.factories import arrays, made_paths, scenes
 from tests.factories.small_model import MODEL
 from tests.laws import gradients
 
@@ -58,9 +58,7 @@ def _config(kind, space="bounded", **changes):
 
 def _trained(config, scale=0.6):
     shapes = jax.eval_shape(lambda: init_params(jax.random.key(0), config))
-    rng = np.random.default_rng(1)
-    made = lambda x: jnp.asarray(scale * rng.normal(size=x.shape), jnp.float32)
-    return jax.tree.map(made, shapes)
+    return arrays.drawn(shapes, scale=scale)
 
 
 def _with_offset(params, *, position=(0.0, 0.0, 0.0), direction=(0.0, 0.0, 0.0)):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from refref_jax.fields.raydef import RaydefParams
+from refref_jax.fields.rosenerf import RosenerfParams
 from refref_jax.geometry.cameras import image_rays
 from refref_jax.render import checkpoint_io
 from refref_jax.render.images import render_image
@@ -27,7 +28,7 @@ def _config(**changes):
     return TrainConfig().override(scene=str(_SCENE), pretraced_batches=4, **small, **given)
 
 
-@pytest.fixture(scope="module", params=["raydef", "raydef_polyline"])
+@pytest.fixture(scope="module", params=["raydef", "raydef_polyline", "rosenerf"])
 def trained(request, tmp_path_factory):
     """A model, and the folder of its run."""
     run = tmp_path_factory.mktemp(request.param) / "run"
@@ -42,16 +43,18 @@ def test_some_steps_lower_the_loss_and_bend_rays(trained):
     assert len(losses) == 60 and np.mean(losses[-10:]) < 0.7 * np.mean(losses[:3])
     names = ("bends", "turns", "offsets")
     assert all(np.isfinite([line[name] for name in names]).all() for line in lines)
-    assert lines[-1]["offsets"] > 10.0 * lines[0]["offsets"] > 0.0
-    polyline = trained[0].config.field.kind == "raydef_polyline"
-    # The directions of a polyline are those of its segments.
-    assert (max(abs(line["turns"]) for line in lines) < 1e-5) == polyline
+    kind = trained[0].config.field.kind
+    assert (lines[0]["offsets"] == 0.0) == (kind == "rosenerf")  # which begins without
+    assert lines[-1]["offsets"] > 10.0 * lines[2]["offsets"] > 0.0
+    # The directions of a polyline are those of its segments, and a second ray is straight.
+    assert (max(abs(line["turns"]) for line in lines) < 1e-5) == (kind != "raydef")
 
 
 def test_a_checkpoint_is_read_and_rendered(trained):
     read, run = trained
     assert (read.config, read.settings) == tuple(vars(checkpoint_io.read_static(run)).values())
-    assert isinstance(read.params.field, RaydefParams) and read.settings.max_bends == 0
+    params = RosenerfParams if read.config.field.kind == "rosenerf" else RaydefParams
+    assert isinstance(read.params.field, params) and read.settings.max_bends == 0
     image = render_image(read, jax.tree.map(lambda x: x[:4, :4], image_rays(CAMERAS, 0)))
     assert np.all(np.isfinite(image.rgb)) and np.all(image.distance > 0.0)
 

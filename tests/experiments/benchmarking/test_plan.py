@@ -67,6 +67,7 @@ def test_methods_are_in_the_order_of_the_table_and_none_hides_a_reconstruction()
         ("tnsr_true_start", ("meshes", "walls")),
         ("raydef", ()),
         ("raydef_polyline", ()),
+        ("rosenerf", ()),
         ("splats", ()),
     ]
     for group in ("main", "ablations"):
