@@ -72,8 +72,8 @@ def main() -> None:
         "rays_per_pixel": _RAYS_PER_PIXEL.value,
     }
     with outputs.fresh(out, **place) as draft:
-        found, views, told = evaluate(model, scene, draft, lpips)
-        summary = sources | found._asdict() | {"warnings": told}
+        found, views, doubts = evaluate(model, scene, draft, lpips)
+        summary = sources | found._asdict() | {"warnings": doubts}
         text = json.dumps(configuration.string_safe(summary), indent=2, allow_nan=False)
         (draft / "metrics.json").write_text(text + "\n", encoding="utf-8")
         comparison.write_comparison(draft / "comparison.png", views)
@@ -83,7 +83,7 @@ def main() -> None:
         summary["results"]["dropped"],
         advice="Train with a larger --min_throughput or a smaller --max_bends.",
     )
-    for sentence in told:
+    for sentence in doubts:
         print(f"warning: {sentence}")
     print(f"Images:   {out / 'comparison.png'}, {out / 'rgb'}, {out / 'distance'}")
     print(f"Metrics:  {out / 'metrics.json'}")
@@ -142,7 +142,7 @@ def evaluate(
             progress=progress,
             on_view=write,
         )
-    return found, views, residuals.tell(errors)
+    return found, views, residuals.warnings(errors)
 
 
 if __name__ == "__main__":

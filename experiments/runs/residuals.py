@@ -1,10 +1,10 @@
-"""Tells what wrong input the residuals of renderings look like: cameras, background or object.
+"""Finds out which wrong input residuals of renderings look like: cameras, background or object.
 
 A photograph that is shifted by a displacement `d` against the rendering differs from it by
 `-gradient . d` to first order, so that least squares over pixels find `d`. Beside the object, where
 light is straight, wrong cameras shift an image, and a background of the wrong size makes it grow.
 Inside the outline, the refracted image grows with errors of index and size, and moves with errors
-of the object's place, direction and shape. Residuals along the outline alone tell of a wrong
+of the object's place, direction and shape. Residuals along the outline alone indicate a wrong
 silhouette. `docs/captures.md` has what each wrong input looks like, measured.
 
 Source: Lucas and Kanade, An Iterative Image Registration Technique (1981), one step.
@@ -28,15 +28,15 @@ _FEWEST = 200
 _SINGULAR = 1e8
 
 
-# Least displacements that are told, pixels: a tenth of a pixel costs about a decibel. They must be
-# larger than this many standard deviations, too.
+# Least displacements that lead to a warning, pixels: a tenth of a pixel costs about a decibel. They
+# must be larger than this many standard deviations, too.
 _SHIFTED, _GROWN, _MOVED = 0.05, 0.1, 0.1
 _CERTAIN = 5.0
 
-# Share of the larger of growth and shift inside the outline below which the other one is not told.
+# Share of the larger of growth and shift inside the outline below which the other one is left out.
 _LESSER = 0.25
 
-# Least residual along the outline that is told, sRGB, and its ratio to that inside.
+# Least residual along the outline that leads to a warning, sRGB, and its ratio to that inside.
 _ROUGH, _ROUGHER = 0.1, 2.0
 
 
@@ -140,7 +140,7 @@ def _rms(errors: Float[np.ndarray, " n"]) -> float | None:
     return float(np.sqrt(np.mean(np.square(errors)))) if errors.size >= _FEWEST else None
 
 
-def tell(views: Sequence[Residuals]) -> tuple[str, ...]:
+def warnings(views: Sequence[Residuals]) -> tuple[str, ...]:
     """Returns what residuals look like, a sentence each; nothing if they look like noise.
 
     Cameras are wrong each in its own way, so that lengths of shifts count; everything else is the
@@ -151,37 +151,37 @@ def tell(views: Sequence[Residuals]) -> tuple[str, ...]:
     """
     beside = [view.beside for view in views if view.beside is not None]
     inside = [view.inside for view in views if view.inside is not None]
-    told = []
+    found = []
     shift, grown = _typical(beside, _shift), _typical(beside, _growth)
     if shift > _SHIFTED:
-        told.append(
+        found.append(
             f"beside the object, images are shifted by {shift:.2f} pixels: cameras are a little "
             "off. Refine them, or do not trust differences of less than a decibel."
         )
     if abs(grown) > _GROWN:
-        told.append(
+        found.append(
             f"beside the object, images are {'larger' if grown > 0.0 else 'smaller'} than they are "
             f"rendered, by {abs(grown):.2f} pixels: check size and centre of the background, and "
             "the focal length."
         )
-    if told:
-        return tuple(told)
+    if found:
+        return tuple(found)
     grown, moved = _typical(inside, _growth), _typical(inside, _shift)
     if abs(grown) > max(_SHIFTED, _LESSER * moved):
-        told.append(
+        found.append(
             f"inside the outline, what is refracted is {'larger' if grown > 0.0 else 'smaller'} "
             f"than it is rendered, by {abs(grown):.2f} pixels: index of refraction or size of the "
             "object. Find them with experiments.reconstruct or experiments.align."
         )
     if moved > max(_MOVED, _LESSER * abs(grown)):
-        told.append(
+        found.append(
             f"inside the outline, what is refracted is shifted by {moved:.2f} pixels: place, "
             "direction or shape of the object. Align its mesh with experiments.align."
         )
-    return tuple(told) or _tell_of_outlines(views)
+    return tuple(found) or _outline_warnings(views)
 
 
-def _tell_of_outlines(views: Sequence[Residuals]) -> tuple[str, ...]:
+def _outline_warnings(views: Sequence[Residuals]) -> tuple[str, ...]:
     pairs = [(v.rim, v.interior) for v in views if v.rim is not None and v.interior is not None]
     if not pairs:
         return ()

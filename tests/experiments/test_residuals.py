@@ -118,13 +118,13 @@ def _views(beside, inside, *, rim=0.03, interior=0.02):
         (_views(_motion(), _motion(), rim=0.15, interior=0.14), None),
     ],
 )
-def test_what_is_told(views, words):
-    told = residuals.tell(views)
-    assert bool(told) == (words is not None)
+def test_warnings_name_the_cause(views, words):
+    found = residuals.warnings(views)
+    assert bool(found) == (words is not None)
     for word in words or ():
-        assert word in " ".join(told)
+        assert word in " ".join(found)
 
 
-def test_an_object_that_is_too_large_and_moved_is_told_as_both():
-    told = residuals.tell(_views(_motion(), _motion(right=0.3, growth=-0.01)))
-    assert len(told) == 2 and "size of the object" in told[0] and "place" in told[1]
+def test_an_object_that_is_too_large_and_moved_leads_to_both_warnings():
+    found = residuals.warnings(_views(_motion(), _motion(right=0.3, growth=-0.01)))
+    assert len(found) == 2 and "size of the object" in found[0] and "place" in found[1]

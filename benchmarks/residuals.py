@@ -1,13 +1,14 @@
-"""Claim: residuals tell which input is wrong, where its error costs a decibel or two.
+"""Claim: residuals show which input is wrong, where its error costs a decibel or two.
 
-    python -m benchmarks.residual_symptoms --scenes=BALL,TORUS,FLASK --out=FOLDER
+    python -m benchmarks.residuals --scenes=BALL,TORUS,FLASK --out=FOLDER
 
 Renders test views before their known background, with one input wrong by a known amount (those of
-`benchmarks.sensitivity`), and writes what `experiments.runs.residuals` measures and tells:
-`residual_symptoms.csv`, one row per scene, input and error.
+`benchmarks.sensitivity`), and writes what `experiments.runs.residuals` measures, and its warnings:
+`residuals.csv`, one row per scene, input and error.
 
-Asserted are: right inputs tell nothing; wrong cameras are told as cameras, a wrong background as a
-background, index and size as a growth inside the outline, place as a shift there.
+Asserted are: no warning for right inputs; warnings of cameras for wrong cameras, of the background
+for a wrong background, of a growth inside the outline for index and size, of a shift there for
+the object's place.
 """
 
 import csv
@@ -58,7 +59,7 @@ class Row(NamedTuple):
     shift_inside: str
     growth_inside: str
     psnr_masked: str
-    told: str
+    warnings: str
 
 
 def main(arguments: list[str]) -> None:
@@ -74,9 +75,9 @@ def main(arguments: list[str]) -> None:
             row = _row(folder, inputs, tree, name, error)
             rows.append(row)
             print(" | ".join(row), flush=True)
-            if word is not None and (word not in row.told or (row.told and not word)):
-                wrong.append(f"{row.scene}: {name} is told as '{row.told}'")
-    with (out / "residual_symptoms.csv").open("w", newline="", encoding="utf-8") as file:
+            if word is not None and (word not in row.warnings or (row.warnings and not word)):
+                wrong.append(f"{row.scene}: {name} leads to '{row.warnings}'")
+    with (out / "residuals.csv").open("w", newline="", encoding="utf-8") as file:
         csv.writer(file, lineterminator="\n").writerows([Row._fields, *rows])
     print(f"Measures: {out / 'residual_symptoms.csv'}")
     assert not wrong, "; ".join(wrong)
@@ -111,7 +112,7 @@ def _row(folder: Path, inputs: Inputs, tree: Containment, name: str, error: floa
         *_medians(views, "beside"),
         *_medians(views, "inside"),
         f"{np.mean(psnr):.2f}",
-        " ".join(residuals.tell(views)),
+        " ".join(residuals.warnings(views)),
     )
 
 
