@@ -24,10 +24,9 @@ from experiments.cli.progress import ProgressBar
 with epy.lazy_imports():
     import numpy as np
 
-    from refref_jax.data.nerfstudio import capture as nerfstudio
-    from refref_jax.data.nerfstudio import conversion
-    from refref_jax.data.nerfstudio import conversion as from_nerfstudio
-    from refref_jax.data.nerfstudio import conversion as to_nerfstudio
+    from experiments.captures import conversion, nerfstudio
+    from experiments.captures import conversion as from_nerfstudio
+    from experiments.captures import conversion as to_nerfstudio
     from refref_jax.reconstruct import visual_hull
 
 _SOURCE = flags.DEFINE_string("source", None, "Folder to convert.", required=True)

@@ -6,11 +6,11 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
+from experiments.captures import conversion as from_nerfstudio
+from experiments.captures import conversion as to_nerfstudio
+from experiments.captures import nerfstudio
+from experiments.captures.conversion import View
 from refref_jax.data import SceneError, image_files, scene_folder
-from refref_jax.data.nerfstudio import capture as nerfstudio
-from refref_jax.data.nerfstudio import conversion as from_nerfstudio
-from refref_jax.data.nerfstudio import conversion as to_nerfstudio
-from refref_jax.data.nerfstudio.conversion import View
 from tests.factories.small_captures import (
     FOCAL,
     HEIGHT,

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import scipy.stats
 
+from experiments.captures import conversion
 from experiments.dataset import cameras
 from experiments.dataset.seeds import seed_of
-from refref_jax.data.nerfstudio import conversion
 from tests.processes.command import ROOT
 
 _BUNDLED = ROOT / "experiments" / "data" / "cube_smcvx_ball"

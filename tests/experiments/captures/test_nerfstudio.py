@@ -5,8 +5,8 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
+from experiments.captures import nerfstudio
 from refref_jax.data import SceneError
-from refref_jax.data.nerfstudio import capture as nerfstudio
 from refref_jax.geometry.cameras import Cameras
 from tests.factories.small_captures import FOCAL, HEIGHT, LENS, WIDTH, edit, pose_of, write_capture
 

@@ -15,10 +15,10 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from experiments.captures import nerfstudio
+from experiments.captures.nerfstudio import CaptureFrame
 from refref_jax import atomic_files
 from refref_jax.data import SceneError, image_files, scene_folder
-from refref_jax.data.nerfstudio import capture as nerfstudio
-from refref_jax.data.nerfstudio.capture import CaptureFrame
 from refref_jax.data.scene_folder import Frames
 
 USUAL_DISTANCE = 4.0

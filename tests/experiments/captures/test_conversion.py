@@ -1,14 +1,14 @@
 import numpy as np
 import pytest
 
-from refref_jax.data import SceneError
-from refref_jax.data.nerfstudio.conversion import (
+from experiments.captures.conversion import (
     Placement,
     centred_windows,
     meeting_point,
     place,
     undo_motion,
 )
+from refref_jax.data import SceneError
 from refref_jax.geometry.cameras import orbit
 from tests.factories.small_captures import pose_of
 
