@@ -43,7 +43,8 @@ def reconstruct(
         installed, if no object fits the masks, or if the folder contains anything else.
     """
     import_skimage()
-    masks = len(scene_folder.read_masks(scene_folder.read_frames(scene, "train")))
+    frames = scene_folder.read_frames(scene, "train")
+    masks = len(scene_folder.read_object_views(frames)[1])
     if config.outliers >= masks:
         raise ValueError(
             f"--outliers={config.outliers}, but there are {masks} train masks. Use fewer."
@@ -55,6 +56,8 @@ def reconstruct(
         found = records.read(out)  # another process may have finished it meanwhile
         if found.geometry is None or not geometry_stage.is_there(out, found.geometry):
             say(f"geometry: {config.geometry} of the training masks, {config.resolution} cells")
+            if without := len(frames.names) - masks:
+                say(f"geometry: {without} training views are left out, whose masks mark no object")
             facts = geometry_stage.run(scene, out, config)
             found = dataclasses.replace(found, geometry=facts, index=None, light=None, report=None)
             records.write(out, found)
