@@ -322,19 +322,18 @@ def read_object_views(frames: Frames) -> tuple[Frames, Bool[np.ndarray, "views h
     Raises:
       SceneError: if the split has no masks, or none of them marks the object.
     """
-    masks = read_masks(frames)
-    assert frames.masks is not None
+    masks, paths = read_masks(frames), frames.masks or ()
     shown = np.flatnonzero(masks.any(axis=(1, 2)))
     if not len(shown):
         raise SceneError(
-            f"None of the {len(masks)} masks in {frames.masks[0].parent} marks the object. Give "
+            f"None of the {len(masks)} masks in {paths[0].parent} marks the object. Give "
             "masks in which the object is not black; docs/masks.md explains how to import them."
         )
     depths = frames.depths and tuple(frames.depths[i] for i in shown)
     kept = Frames(
         names=tuple(frames.names[i] for i in shown),
         images=tuple(frames.images[i] for i in shown),
-        masks=tuple(frames.masks[i] for i in shown),
+        masks=tuple(paths[i] for i in shown),
         depths=depths,
         cameras=frames.cameras._replace(poses=frames.cameras.poses[shown]),
     )
@@ -465,10 +464,7 @@ def add_masks(scene: Path, out: Path, segment: Segment) -> int:
 
 
 def _add_to_split(scene: Path, path: Path, segment: Segment) -> list[bool]:
-    """Writes the masks of one split of the copy, and names them in its transforms file.
-
-    Returns whether each of them marks the object.
-    """
+    """Writes masks of a split of the copy; returns whether each of them marks the object."""
     marked = []
     content = read_json(path)
     frames = get(content, "frames", path)
