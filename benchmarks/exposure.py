@@ -6,8 +6,8 @@
 Copies the scene, and multiplies the linear colours of each training image by three gains, drawn
 log-normally. Trains a backdrop, or a field, on the original images, on the copy with
 `exposure=fixed`, and on the copy with `exposure=per_image`, and evaluates all on the original test
-views. Prints PSNR, masked PSNR, and the largest error of a gain. Asserted is that learned gains lose at most
-`--largest_loss` dB inside the mask.
+views. Prints PSNR, masked PSNR, and the largest error of a gain. Asserted is that learned gains
+lose at most `--largest_loss` dB inside the mask.
 """
 
 import json

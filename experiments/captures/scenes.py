@@ -32,6 +32,9 @@ POINTS = "points.ply"
 Sense = Literal["object", "background", "none"]
 """White area of a capture's masks: the object or the background; `none` for no masks."""
 
+# Limits of a camera: tangent of half its field of view, and pixels of its images.
+_LEAST_TANGENT, _MOST_PIXELS = 1e-3, 1 << 26
+
 # Width of the masks in which the object is searched, pixels.
 _COARSE = 200
 
@@ -105,15 +108,31 @@ def find_layout(
         size = np.array([crop.columns.size, crop.rows.size])
         kept = np.array([np.prod(size / frame.intrinsics[4:]) for frame in found])
         pinhole = Pinhole(crop.columns.size, crop.rows.size, crop.focal)
+        _check_size(pinhole, found[0].name)
         return Layout(tuple(found), frames, pinhole, crop, True, kept, found[0].name)
     turned = resampling.turns([frame.lens for frame in found])
     frames = tuple(
         Frame(frame.name, frame.lens, turn) for frame, turn in zip(found, turned, strict=True)
     )
     shared = resampling.share(frames, width=width)
+    _check_size(shared.pinhole, shared.narrowest)
     return Layout(
         tuple(found), frames, shared.pinhole, None, shared.exact, shared.kept, shared.narrowest
     )
+
+
+def _check_size(pinhole: Pinhole, name: str) -> None:
+    """Refuses cameras of which no scene can have images."""
+    width, height, focal = pinhole
+    if not _LEAST_TANGENT <= 0.5 * width / focal <= 1.0 / _LEAST_TANGENT:
+        raise SceneError(
+            f"The focal length is {focal:g} pixels for images of {width} x {height}, as that of "
+            f"{name}. Check the focal lengths of the capture."
+        )
+    if width * height > _MOST_PIXELS:
+        raise SceneError(
+            f"Images of {width} x {height} pixels are too large. Give a smaller width (--width)."
+        )
 
 
 def turned_poses(

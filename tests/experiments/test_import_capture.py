@@ -319,6 +319,8 @@ def _folds(content):
     ("options", "change", "message"),
     [
         ((), _folds, "images/frame_00001.png folds at most"),
+        ((), lambda c: c.update(fl_x=1e-9, fl_y=1e-9), "The focal length is 1e-09 pixels for imag"),
+        (("--width=20000",), None, "Images of 20000 x 16666 pixels are too large"),
         (("--centre=meshes",), None, "there are no meshes. Give their folder: --meshes."),
         (("--centre=masks", "--masks=none"), None, "the capture has no masks. Give --mask_folder."),
         (("--scale=object", "--masks=none"), None, "neither meshes nor masks show it"),

@@ -322,7 +322,7 @@ def test_a_field_learns_the_exposure_of_each_image_if_it_is_asked_to():
     assert "exposure=per_image" in resolved.describe()
     assert _resolve(_EMPTY).model.config.learned_gains == 0
     assert _resolve(_EMPTY, exposure="fixed").model.config.learned_gains == 0
-    with pytest.raises(ValueError, match="No effect on Gaussian splats.*exposure"):
+    with pytest.raises(ValueError, match=r"No effect on Gaussian splats.*exposure"):
         _resolve(_EMPTY, exposure="per_image", field="splats")
 
 
