@@ -40,6 +40,8 @@ def main() -> None:
     if not folder.is_dir():
         raise SceneError(f"{folder} is not a folder. Give the folder that contains the masks.")
 
+    empty: list[Path] = []
+
     def read(image: Path) -> Bool[np.ndarray, "h w"]:
         path = folder / image.relative_to(scene)
         if not path.is_file():
@@ -47,10 +49,14 @@ def main() -> None:
                 f"There is no mask of {image}: {path} does not exist. Save it there, or remove the "
                 "frame from the transforms file."
             )
-        return image_files.read_mask(path)
+        mask = image_files.read_mask(path)
+        empty.extend([] if mask.any() else [path])
+        return mask
 
     count = scene_folder.add_masks(scene, out, read)
     print(f"Masks: {count}")
+    if empty:
+        print(f"{len(empty)} mark no object, such as {empty[0]}: R3F leaves out these views")
     print(f"Scene: {out}")
     print(f"Next: {app.shell('reconstruct', f'--scene={out}', f'--out={out}_r3f')}")
 

@@ -288,11 +288,6 @@ _CASES = {
     "moving image": (_save(_RGB, "PNG", save_all=True, append_images=[_RGB] * 3), _IMAGE, "4 pict"),
     "image of inks": (_save(_RGB.convert("CMYK"), "JPEG"), _IMAGE, "CMYK"),
     "mask of another size": (lambda s: write_grey(s / _MASK, np.ones((3, 3))), _MASK, "3 x 3"),
-    "mask without an object": (
-        lambda s: write_grey(s / _MASK, np.zeros((HEIGHT, WIDTH))),
-        _MASK,
-        "marks no object",
-    ),
     "depth of two channels": (_exr(_DEPTH, {"Y": _PIXELS, "Z": _PIXELS}), _DEPTH, "one channel"),
     "depth not a number": (_exr(_DEPTH, {"Z": _PIXELS * np.nan}), _DEPTH, "not a number"),
     "depth text": (_write(_DEPTH, b"v/1\x01"), _DEPTH, "cannot be read as EXR"),

@@ -61,6 +61,8 @@ def reconstruct(
         if found.geometry is None or not geometry_stage.is_there(out, found.geometry):
             read = "images" if config.geometry == field_surface.NAME else "masks"
             say(f"geometry: {config.geometry} of the training {read}, {config.resolution} cells")
+            if without := _views_without_object(scene):
+                say(f"geometry: {without} training views are left out, whose masks mark no object")
             facts = geometry_stage.run(scene, out, config)
             found = dataclasses.replace(found, geometry=facts, index=None, light=None, report=None)
             records.write(out, found)
@@ -80,7 +82,8 @@ def reconstruct(
 
 def _check_masks(scene: Path, config: ReconstructionConfig) -> None:
     """Reads all masks, also those that judge: broken files are reported now, not after hours."""
-    masks = len(scene_folder.read_masks(scene_folder.read_frames(scene, "train")))
+    frames = scene_folder.read_frames(scene, "train")
+    masks = len(scene_folder.read_object_views(frames)[1])
     if config.outliers >= masks:
         raise ValueError(
             f"--outliers={config.outliers}, but there are {masks} train masks. Use fewer."
@@ -90,6 +93,11 @@ def _check_masks(scene: Path, config: ReconstructionConfig) -> None:
             frames = scene_folder.read_frames(scene, split)
             if frames.masks is not None:
                 scene_folder.read_masks(frames)
+
+
+def _views_without_object(scene: Path) -> int:
+    masks = scene_folder.read_masks(scene_folder.read_frames(scene, "train"))
+    return int((~masks.any(axis=(1, 2))).sum())
 
 
 def read_parts(out: Path) -> list[MeshPart]:

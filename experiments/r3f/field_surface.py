@@ -66,7 +66,7 @@ def masked_scene(scene: Path, out: Path, config: ReconstructionConfig) -> Path:
       config: options of the reconstruction.
 
     Raises:
-      SceneError: if a view does not show the surface.
+      SceneError: if no view shows the surface.
       ValueError: if the field has no surface, or cannot be trained on the scene.
       KeyboardInterrupt: if its training was stopped; it has been saved.
     """

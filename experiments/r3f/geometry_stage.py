@@ -91,8 +91,8 @@ def run(scene: Path, out: Path, config: ReconstructionConfig) -> GeometryFacts:
     Raises:
       ValueError: if there are no masks, or no object fits them.
     """
-    frames = scene_folder.read_frames(scene, "train")
-    views = Views(scene_folder.read_masks(frames), frames.cameras)
+    frames, masks = scene_folder.read_object_views(scene_folder.read_frames(scene, "train"))
+    views = Views(masks, frames.cameras)
     names = [_within(path, scene).as_posix() for path in frames.masks]
     cut = find_isosurface(GEOMETRIES[config.geometry](Inputs(scene, out, views, names), config))
     trusted = without_outliers(cut, views, config.outliers)

@@ -50,10 +50,10 @@ def draw(
         NaN without any.
       names: what both surfaces are called.
     """
-    frames = scene_folder.read_frames(scene, split)
+    frames, masks = scene_folder.read_object_views(scene_folder.read_frames(scene, split))
     count = len(frames.names)
     chosen = np.unique(np.linspace(0, count - 1, min(_ROWS, count)).astype(int))
-    masks, images = scene_folder.read_masks(frames), scene_folder.read_images(frames)
+    images = scene_folder.read_images(frames)
     titles = ["photograph", *names, "error before", "error after"]
     titles += [] if deviations is None else ["normals ±"]
     figure, axes = pyplot.subplots(

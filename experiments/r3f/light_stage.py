@@ -247,7 +247,8 @@ def read(scene: Path, *, seed: int) -> Seen:
     """
     fitted = index_stage.photographs(scene, "train", seed=seed, rays=_FITTED)
     path = scene / "transforms_val.json"
-    if path.is_file() and scene_folder.read_frames(scene, "val").masks is not None:
+    held_out = scene_folder.read_frames(scene, "val") if path.is_file() else None
+    if held_out is not None and held_out.masks and scene_folder.read_masks(held_out).any():
         judges = index_stage.photographs(scene, "val", seed=seed + 1, rays=_JUDGES)
         return Seen(fitted, judges, "val")
     held = np.isin(fitted.views, np.unique(fitted.views)[::_ONE_IN])
@@ -257,9 +258,9 @@ def read(scene: Path, *, seed: int) -> Seen:
 
 
 def read_views(scene: Path) -> Views:
-    """Returns the masks of the training views, with their cameras."""
-    frames = scene_folder.read_frames(scene, "train")
-    return Views(scene_folder.read_masks(frames), frames.cameras)
+    """Returns the masks of the training views that show the object, with their cameras."""
+    frames, masks = scene_folder.read_object_views(scene_folder.read_frames(scene, "train"))
+    return Views(masks, frames.cameras)
 
 
 def look_at_ends(

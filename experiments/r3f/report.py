@@ -109,14 +109,16 @@ def is_there(out: Path) -> bool:
 def judging_frames(scene: Path) -> tuple[str, Frames]:
     """Returns the views that a report measures, and their split.
 
-    Held-out splits come first; the first split with masks is used.
+    Held-out splits come first; the first split with masks is used. Views without the object are
+    left out.
     """
     for split in _SPLITS[:-1]:
         if (scene / f"transforms_{split}.json").is_file():
             frames = scene_folder.read_frames(scene, split)
-            if frames.masks is not None:
-                return split, frames
-    return _SPLITS[-1], scene_folder.read_frames(scene, _SPLITS[-1])
+            if frames.masks is not None and scene_folder.read_masks(frames).any():
+                return split, scene_folder.read_object_views(frames)[0]
+    frames = scene_folder.read_frames(scene, _SPLITS[-1])
+    return _SPLITS[-1], scene_folder.read_object_views(frames)[0]
 
 
 def _outlines(mesh: Mesh, frames: Frames) -> list[Outline]:

@@ -22,10 +22,12 @@ class PixelBatch(NamedTuple):
     Attributes:
       rays: camera rays.
       rgb: colours, 8-bit sRGB.
+      views: index of the image of each pixel.
     """
 
     rays: Rays
     rgb: UInt8[np.ndarray, "*shape 3"]
+    views: Int[np.ndarray, "*shape"]
 
 
 def check_batch(cameras: Cameras, batch: int) -> None:
@@ -116,7 +118,8 @@ class PixelSampler:
         frame, row, column = np.unravel_index(
             index, (len(self._cameras.poses), self._cameras.height, self._cameras.width)
         )
-        return PixelBatch(pixel_rays(self._cameras, frame, row, column), self._pixels[index])
+        rays = pixel_rays(self._cameras, frame, row, column)
+        return PixelBatch(rays, self._pixels[index], np.asarray(frame, np.int32))
 
     def _generator(self, number: int) -> np.random.Generator:
         return np.random.Generator(np.random.Philox(key=[self._seed, number]))

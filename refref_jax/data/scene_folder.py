@@ -302,10 +302,10 @@ def read_images(frames: Frames) -> UInt8[np.ndarray, "frames h w 3"]:
 
 
 def read_masks(frames: Frames) -> Bool[np.ndarray, "frames h w"]:
-    """Reads the object masks of a split.
+    """Reads the object masks of a split; those of views without the object are empty.
 
     Raises:
-      SceneError: if the split has none, or one of them marks no object.
+      SceneError: if the split has none.
     """
     if frames.masks is None:
         raise SceneError(
@@ -314,6 +314,30 @@ def read_masks(frames: Frames) -> Bool[np.ndarray, "frames h w"]:
             "segmentation model."
         )
     return np.stack(list(_masks(frames)))
+
+
+def read_object_views(frames: Frames) -> tuple[Frames, Bool[np.ndarray, "views h w"]]:
+    """Returns the frames of a split whose masks mark the object, and these masks.
+
+    Raises:
+      SceneError: if the split has no masks, or none of them marks the object.
+    """
+    masks, paths = read_masks(frames), frames.masks or ()
+    shown = np.flatnonzero(masks.any(axis=(1, 2)))
+    if not len(shown):
+        raise SceneError(
+            f"None of the {len(masks)} masks in {paths[0].parent} marks the object. Give "
+            "masks in which the object is not black; docs/masks.md explains how to import them."
+        )
+    depths = frames.depths and tuple(frames.depths[i] for i in shown)
+    kept = Frames(
+        names=tuple(frames.names[i] for i in shown),
+        images=tuple(frames.images[i] for i in shown),
+        masks=tuple(paths[i] for i in shown),
+        depths=depths,
+        cameras=frames.cameras._replace(poses=frames.cameras.poses[shown]),
+    )
+    return kept, masks[shown]
 
 
 def read_distances(frames: Frames) -> Float[np.ndarray, "frames h w"]:
@@ -336,13 +360,7 @@ def _images(frames: Frames) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
 
 def _masks(frames: Frames) -> Iterator[Bool[np.ndarray, "h w"]]:
     for path in frames.masks or ():
-        mask = _checked(image_files.read_mask(path), path, frames)
-        if not mask.any():
-            raise SceneError(
-                f"{path} marks no object. Render the mask again, or remove the frame from the "
-                "transforms file."
-            )
-        yield mask
+        yield _checked(image_files.read_mask(path), path, frames)
 
 
 def _depths(frames: Frames) -> Iterator[Float[np.ndarray, "h w"]]:
@@ -423,8 +441,8 @@ def add_masks(scene: Path, out: Path, segment: Segment) -> int:
       The number of masks.
 
     Raises:
-      SceneError: if the copy exists, the scene is broken, or a mask is not boolean, not of the size
-        of its image, or empty.
+      SceneError: if the copy exists, the scene is broken, or a mask is not boolean or not of the
+        size of its image, or if no mask marks the object.
     """
     read_json(scene / "transforms_train.json")
     if out.exists():
@@ -434,12 +452,20 @@ def add_masks(scene: Path, out: Path, segment: Segment) -> int:
     with atomic_files.new_folder(out) as draft:
         shutil.copytree(scene, draft, dirs_exist_ok=True)
         paths = (draft / f"transforms_{split}.json" for split in SPLITS)
-        count = sum(_add_to_split(scene, path, segment) for path in paths if path.is_file())
-    return count
+        marked = [
+            each for path in paths if path.is_file() for each in _add_to_split(scene, path, segment)
+        ]
+        if not any(marked):
+            raise SceneError(
+                f"None of the {len(marked)} masks of {scene} marks the object. Check the model, or "
+                "the level above which its output is the object."
+            )
+    return len(marked)
 
 
-def _add_to_split(scene: Path, path: Path, segment: Segment) -> int:
-    """Writes the masks of one split of the copy, and names them in its transforms file."""
+def _add_to_split(scene: Path, path: Path, segment: Segment) -> list[bool]:
+    """Writes masks of a split of the copy; returns whether each of them marks the object."""
+    marked = []
     content = read_json(path)
     frames = get(content, "frames", path)
     for frame in frames:
@@ -450,12 +476,13 @@ def _add_to_split(scene: Path, path: Path, segment: Segment) -> int:
                 "images there, and give their names relative to it."
             )
         mask = _mask_of(scene / f"{stem}.png", segment)
+        marked.append(bool(mask.any()))
         name = Path("mask") / f"{stem}.png"
         (path.parent / name).parent.mkdir(parents=True, exist_ok=True)
         image_files.write_mask(path.parent / name, mask)
         frame["mask_file_path"] = f"./{name.as_posix()}"
     path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-    return len(frames)
+    return marked
 
 
 def _mask_of(image: Path, segment: Segment) -> Bool[np.ndarray, "h w"]:
@@ -466,10 +493,5 @@ def _mask_of(image: Path, segment: Segment) -> Bool[np.ndarray, "h w"]:
             f"The mask of {image} is an array {mask.dtype}{list(mask.shape)}, not "
             f"bool{list(expected)}. Compare the model's output with a threshold, and resize it to "
             "the image without interpolation."
-        )
-    if not mask.any():
-        raise SceneError(
-            f"The mask of {image} marks no object. Mark the object by hand, or remove the frame "
-            "from the transforms file."
         )
     return mask

@@ -141,6 +141,7 @@ class ModelConfig:
         as in models of earlier versions, or at the `end` of the path, which is on a surface if the
         scene is bounded or spherical; if it is unbounded, always in the middle.
       splats: Gaussians that take the place of all fields, or `None`.
+      learned_gains: number of training images whose exposure is learned, all of them or 0.
     """
 
     proposals: tuple[ProposalConfig, ...]
@@ -160,6 +161,7 @@ class ModelConfig:
     backdrop: BackdropConfig | None = None
     last_sample: LastSample = "middle"
     splats: SplatsConfig | None = None
+    learned_gains: int = 0
 
     @property
     def domain(self) -> scene_bounds.Domain:
@@ -257,11 +259,14 @@ class Params(NamedTuple):
       field: parameters of the radiance field, the pyramid of a backdrop, or both (`Layers`); or
         Gaussian splats.
       tints: learned tints and absorption of the parts, if any.
+      gains: logarithm of the gain of each training image, up to a constant per channel, if learned;
+        rendering has a gain of 1.
     """
 
     proposals: tuple[base.Params, ...]
     field: base.Params
     tints: LearnedTints | None = None
+    gains: Float[Array, "views 3"] | None = None
 
 
 class Model(NamedTuple):
@@ -299,7 +304,8 @@ def init_params(key: Array, config: ModelConfig) -> Params:
     if config.backdrop is not None:
         surface = backdrop.init(config.backdrop.resolution, axes=config.backdrop.axes)
         field = Layers(field, surface)
-    return Params(proposals, field, colours)
+    gains = jnp.zeros((config.learned_gains, 3)) if config.learned_gains else None
+    return Params(proposals, field, colours, gains)
 
 
 def has_foreground(config: ModelConfig) -> bool:

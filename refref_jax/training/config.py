@@ -36,7 +36,7 @@ FIELD_ONLY = (
 )
 """Options that only a radiance field reads."""
 
-BACKDROP_ONLY = ("backdrop_resolution", "iterations", "most_pixels", "exposure", "view_dependence")
+BACKDROP_ONLY = ("backdrop_resolution", "iterations", "most_pixels", "view_dependence")
 """Options that only a backdrop reads."""
 
 BACKDROP_PIXELS = 64_000_000
@@ -195,7 +195,7 @@ class FieldConfig:
       most_pixels: Largest number of pixels whose equations are in memory at once; of more, each
         round of 8 iterations takes others, drawn at random.
       exposure: Exposure and white balance of the training images: fixed, or a learned gain for each
-        image and channel (per_image), for captures; only of a backdrop.
+        image and channel (per_image), for captures. Test images are rendered with a gain of 1.
       view_dependence: Dependence of a backdrop's radiance on the direction of light: none, or
         linear, for walls that shine.
     """

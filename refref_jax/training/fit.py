@@ -38,6 +38,7 @@ from refref_jax.training import (
 )
 from refref_jax.training.config import TrainConfig, require
 from refref_jax.training.loop import TrainState, init_state
+from refref_jax.training.objective import gains
 from refref_jax.training.resolve import Resolved, build_scene, read_facts, resolve
 from refref_jax.training.run_folder import Checkpoints
 
@@ -105,17 +106,9 @@ def fit(
     with contextlib.ExitStack() as stack:
         if out is None:
             out = stack.enter_context(tempfile.TemporaryDirectory(prefix="refref_jax_"))
-        train_into(
-            Path(out),
-            config,
-            existing=existing,
-            parts=parts,
-            progress=progress,
-            report=report,
-            stop=stop,
-            periods=periods,
-            mesh=mesh,
-        )
+        how: dict[str, Any] = {"existing": existing, "parts": parts, "periods": periods}
+        how |= {"progress": progress, "report": report, "stop": stop, "mesh": mesh}
+        train_into(Path(out), config, **how)
         return checkpoint_io.load_model(out)
 
 
@@ -336,7 +329,8 @@ def _train_field(
     begun = begun if surface else time.monotonic()
     schedule = config.schedule
     total, batch = require(schedule.steps), require(schedule.batch)
-    steps = _Steps(functools.partial(loop.run_steps, setup), total, batch)
+    names = scene_folder.read_frames(folder, "train").names if model.config.learned_gains else ()
+    steps = _Steps(functools.partial(loop.run_steps, setup), total, batch, names)
     return _take_steps(run, steps, state, checkpoints, log, begun)
 
 
@@ -402,11 +396,13 @@ class _Steps(NamedTuple):
         states and their reports, as `loop.run_steps` does.
       total: number of steps of the run.
       rays: number of rays per step.
+      names: names of the training images, if their gains are learned.
     """
 
     take: Callable[..., Iterator[tuple[TrainState, Any]]]
     total: int
     rays: int
+    names: tuple[str, ...] = ()
 
 
 def _splats(config: TrainConfig, model: ModelConfig, folder: Path) -> tuple[TrainState, _Steps]:
@@ -470,6 +466,8 @@ def _take_steps(
         stopping = devices.any_process(stop())
         if step % periods.checkpoint == 0 or step == total or stopping:
             checkpoints.save(stepped)
+            if steps.names and writes:
+                run_folder.write_gains(run, steps.names, jax.device_get(gains(stepped.params)))
         if stopping:
             break
     return step

@@ -135,18 +135,20 @@ class PretracedBatches(NamedTuple):
       traced: light paths, stacked by batch.
       rgb: true colours, 8-bit sRGB.
       order: index of the batch of each step.
+      views: index of the image of each ray, if the exposure of images is learned.
     """
 
     traced: Traced
     rgb: UInt8[Array, "batches rays 3"]
     order: Int[Array, " steps"]
+    views: Int[Array, "batches rays"] | None = None
 
 
 # Sharding of pre-traced batches: every device has a share of the paths of every batch, and all
 # colours. `Any`, as a specification takes the place of each array.
 _SHARE: Any = PartitionSpec(None, AXIS)
 _WHOLE: Any = PartitionSpec()
-_SHARED = PretracedBatches(traced=Traced(paths=_SHARE, dropped=_WHOLE), rgb=_WHOLE, order=_WHOLE)
+_SHARED = PretracedBatches(Traced(paths=_SHARE, dropped=_WHOLE), _WHOLE, _WHOLE, _WHOLE)
 
 
 @functools.partial(jax.jit, static_argnames=("settings", "capacity", "detail", "mesh"))
@@ -253,7 +255,8 @@ def _step(
 ) -> tuple[TrainState, StepReport]:
     """Takes one step, with this device's paths of the batch."""
     batch = pretraced.order[place]
-    traced, rgb = jax.tree.map(lambda x: x[batch], (pretraced.traced, pretraced.rgb))
+    kept = pretraced.traced, pretraced.rgb, pretraced.views
+    traced, rgb, views = jax.tree.map(lambda x: x[batch], kept)
     key = jax.random.fold_in(jax.random.key(config.seed), state.step)
     branches = (
         path_tracing.branches_of(learned_surface.settings_of(config)) if bends_light(model) else 1
@@ -276,7 +279,9 @@ def _step(
     def combine(params: Params, totals: Totals) -> tuple[Float[Array, ""], StepReport]:
         target = rgb.astype(jnp.float32) / 255.0
         losses, dropped = config.losses, traced.dropped
-        report = objective.measure(params, totals, target, dropped, losses, progress=progress)
+        report = objective.measure(
+            params, totals, target, dropped, losses, progress=progress, views=views
+        )
         return report.loss, report
 
     # The sums over paths are summed over devices between the two halves.
@@ -468,7 +473,9 @@ def trace_batches(setup: Setup, numbers: Sequence[int]) -> PretracedBatches:
         mesh=setup.mesh,
     )
     order = np.arange(len(numbers), dtype=np.int32)
-    return PretracedBatches(traced, *devices.put_everywhere((drawn.rgb, order), mesh=setup.mesh))
+    views = drawn.views if setup.model.learned_gains else None
+    host = drawn.rgb, order, views
+    return PretracedBatches(traced, *devices.put_everywhere(host, mesh=setup.mesh))
 
 
 def _trace_epoch(setup: Setup) -> PretracedBatches | None:

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax import numerics
 from refref_jax.fields import hash_grid
@@ -226,6 +226,7 @@ def measure(
     config: LossConfig,
     *,
     progress: Float[Array, ""] | None = None,
+    views: Int[Array, " rays"] | None = None,
 ) -> StepReport:
     """Returns the losses of a batch; losses of paths are averaged over the included paths.
 
@@ -236,8 +237,10 @@ def measure(
       dropped: dropped throughput of the rays.
       config: weights of the losses.
       progress: progress of the training, 0 to 1, if the field has a surface.
+      views: index of the image of each ray, if the gains of images are learned.
     """
-    rgb = pixels.linear_to_srgb(totals.linear)
+    linear = totals.linear if views is None else totals.linear * gains(params)[views]
+    rgb = pixels.linear_to_srgb(linear)
     mse = mean_squared_error(rgb, target)
     data = mse if config.data == "mse" else charbonnier(rgb, target)
     # Without paths, both are 0 with gradient 0.
@@ -269,6 +272,19 @@ def measure(
     loss += require(config.eikonal) * eikonal + weight * curvature
     share = numerics.safe_divide(sums.share, totals.paths)
     return report._replace(loss=loss, eikonal=eikonal, curvature=curvature, surface_share=share)
+
+
+def gains(params: Params) -> Float[Array, "views 3"]:
+    """Returns the learned gains of the training images; their geometric mean is 1.
+
+    Without this constraint, brighter gains and a darker field would be the same.
+
+    Raises:
+      ValueError: if they are not learned.
+    """
+    if params.gains is None:
+        raise ValueError("These parameters have no gains. Train with exposure=per_image.")
+    return jnp.exp(params.gains - jnp.mean(params.gains, axis=0, keepdims=True))
 
 
 def curvature_schedule(progress: Float[Array, ""]) -> Float[Array, ""]:

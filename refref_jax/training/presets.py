@@ -161,8 +161,8 @@ def override_model(
         )
     if asked.exposure == "per_image" and in_front == "field":
         raise ValueError(
-            "exposure=per_image, but this scene needs a field in front of its backdrop, and a "
-            "field has one exposure for all images. Leave it out."
+            "exposure=per_image, but this scene needs a field in front of its backdrop, which are "
+            "learned one after the other, with one exposure. Use far_field=field."
         )
     if asked.far_field == "backdrop":
         cells = asked.backdrop_resolution or BACKDROP_RESOLUTION
@@ -304,7 +304,7 @@ def unread_by_splats(config: TrainConfig) -> list[str]:
     """Returns the options that have no effect on Gaussian splats; none for other fields."""
     if config.model.field != SPLATS:
         return []
-    names = (*FIELD_ONLY, *BACKDROP_ONLY, *_NOT_READ)
+    names = (*FIELD_ONLY, *BACKDROP_ONLY, "exposure", *_NOT_READ)
     return [name for name in names if name not in _READ_BY_SPLATS]
 
 

@@ -319,6 +319,8 @@ def _resolve_model(
         why = f"preset={config.model.preset}, and only the background is behind the objects"
         config = _decide(config, reasons, why, samples_per_ray=fewer)
     in_front: choices.InFront = "field" if _in_front(config, facts) else "nothing"
+    if config.model.exposure == "per_image" and config.model.far_field == "field":
+        model = dataclasses.replace(model, learned_gains=len(facts.cameras.poses))
     model = presets.override_model(model, config.model, in_front=in_front)
     why = f"preset={config.model.preset}"
     return model, _decide(config, reasons, why, **presets.sampling_of(model))

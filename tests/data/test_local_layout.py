@@ -324,10 +324,23 @@ def test_a_transposed_pose_is_no_rigid_motion(scene):
         scene_folder.read_frames(scene, "train")
 
 
-def test_a_mask_without_object(scene):
+def test_a_view_without_the_object_is_a_view(scene):
     write_grey(scene / "mask/train/r_001.png", np.zeros((HEIGHT, WIDTH)))
-    with scene_error("mask/train/r_001.png", "marks no object", "Render the mask again"):
-        scene_folder.read_masks(scene_folder.read_frames(scene, "train"))
+    scene_folder.check_scene(scene)
+    frames = scene_folder.read_frames(scene, "train")
+    assert scene_folder.read_masks(frames).any(axis=(1, 2)).tolist() == [True, False]
+    kept, masks = scene_folder.read_object_views(frames)
+    assert kept.names == ("r_000",) and len(masks) == len(kept.cameras.poses) == 1
+    for before, after in zip(frames[1:4], kept[1:4], strict=True):
+        assert after == before[:1]
+    np.testing.assert_array_equal(kept.cameras.poses[0], frames.cameras.poses[0])
+
+
+def test_masks_none_of_which_marks_the_object(scene):
+    for name in ("r_000", "r_001"):
+        write_grey(scene / f"mask/train/{name}.png", np.zeros((HEIGHT, WIDTH)))
+    with scene_error("mask/train", "None of the 2 masks", "docs/masks.md"):
+        scene_folder.read_object_views(scene_folder.read_frames(scene, "train"))
 
 
 @pytest.mark.parametrize(

@@ -57,7 +57,7 @@ def test_masks_of_before_are_replaced_in_the_copy_alone(tmp_path):
 @pytest.mark.parametrize(
     ("answer", "message"),
     [
-        (np.zeros((HEIGHT, WIDTH), bool), "marks no object"),
+        (np.zeros((HEIGHT, WIDTH), bool), "None of the 2 masks of .* marks the object"),
         (np.ones((HEIGHT, WIDTH)), "Compare the model's output with a threshold"),
         (np.ones((WIDTH, HEIGHT), bool), "resize it to the image"),
     ],

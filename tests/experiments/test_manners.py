@@ -172,7 +172,7 @@ _MISTAKES = {
         "x --cut=2": "Give 0.02 for 2 %",
         "nowhere": "nowhere is not a folder.",
     },
-    "convert_nerfstudio": {
+    "import_capture": {
         "--source=x --out=OUT --scale=-1": "Give a positive number",
         "--source=x --out=OUT --centre=1,2": "Give x,y,z",
         "--source=x --out=OUT --centre=1,2,x": "has 'x', which is not a finite number",

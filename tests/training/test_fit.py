@@ -1,6 +1,7 @@
 """Training by calls of the library: the script of the README, and what a run's files repeat."""
 
 import ast
+import json
 import re
 import shutil
 
@@ -9,8 +10,10 @@ import jax
 import numpy as np
 import pytest
 
-from refref_jax.data import meshes, scene_folder
+from refref_jax.data import image_files, meshes, scene_folder
+from refref_jax.geometry.cameras import image_rays
 from refref_jax.render import checkpoint_io
+from refref_jax.render.images import render_image
 from refref_jax.training import fit, run_folder
 from refref_jax.training.config import TrainConfig
 from tests.factories import small_scenes
@@ -159,3 +162,49 @@ def test_images_that_change_under_a_run_are_named(tmp_path):
     (tmp_path / "images.json").write_text("{")
     with pytest.raises(ValueError, match=r"images\.json is damaged"):
         run_folder.check_images(tmp_path, frames)
+
+
+def _exposed(scene, gains):
+    """Multiplies the linear light of the training images, which are made smooth and dim first."""
+    frames = scene_folder.read_frames(scene, "train")
+    for path, gain in zip(frames.images, gains, strict=True):
+        linear = gain * np.full((frames.cameras.height, frames.cameras.width, 3), (0.2, 0.3, 0.4))
+        encoded = 1.055 * linear ** (1.0 / 2.4) - 0.055
+        image_files.write_rgb(path, encoded)
+
+
+@pytest.mark.slow
+def test_a_field_learns_the_gains_of_its_images(tmp_path):
+    scene = small_scenes.write_scene(tmp_path / "cube_smcvx_scene", frames=4)
+    draw = np.random.default_rng(0).normal(0.0, 0.2, (4, 3))
+    gains = np.exp(draw - draw.mean(axis=0))
+    _exposed(scene, gains)
+    options = {"paths": "straight", "steps": 120, "batch": 64, "pretraced_batches": 4}
+    config = TrainConfig().override(scene=str(scene), exposure="per_image", **options)
+    lines, periods = [], fit.Periods(log=40, checkpoint=40)
+    whole = fit.fit(config, out=tmp_path / "whole", report=lines.append, periods=periods)
+    assert whole.config.learned_gains == 4 and any("exposure=per_image" in x for x in lines)
+    found = json.loads((tmp_path / "whole" / "gains.json").read_text())
+    assert list(found) == list(scene_folder.read_frames(scene, "train").names)
+    assert np.abs(np.array(list(found.values())) / gains - 1.0).max() < 0.05
+    # Images are rendered with a gain of 1.
+    cameras = scene_folder.read_frames(scene, "train").cameras
+    seen = np.asarray(render_image(whole, image_rays(cameras, 0)).rgb)
+    usual = 1.055 * np.array([0.2, 0.3, 0.4]) ** (1.0 / 2.4) - 0.055
+    np.testing.assert_allclose(seen.mean(axis=(0, 1)), usual, atol=0.02)
+
+
+@pytest.mark.slow
+def test_a_stopped_run_with_gains_ends_with_the_same_bits(tmp_path):
+    scene = small_scenes.write_scene(tmp_path / "cube_smcvx_scene", frames=4)
+    options = {"paths": "straight", "steps": 12, "batch": 64, "pretraced_batches": 4}
+    config = TrainConfig().override(scene=str(scene), exposure="per_image", **options)
+    given = {"report": lambda line: None, "periods": fit.Periods(log=4, checkpoint=4)}
+    whole = fit.fit(config, out=tmp_path / "whole", **given)
+    gains = tmp_path / "run" / "gains.json"
+    fit.fit(config, out=tmp_path / "run", **given, stop=gains.exists)
+    assert 0 < run_folder.read_metrics(tmp_path / "run")[-1]["step"] < 12
+    again = fit.fit(None, out=tmp_path / "run", existing="resume", **given)
+    pairs = zip(jax.tree.leaves(again.params), jax.tree.leaves(whole.params), strict=True)
+    assert all(np.array_equal(ours, theirs) for ours, theirs in pairs)
+    assert gains.read_bytes() == (tmp_path / "whole" / "gains.json").read_bytes()

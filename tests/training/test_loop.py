@@ -91,7 +91,7 @@ def test_a_checkpoint_of_an_earlier_version_is_read(tmp_path):
     config = dataclasses.replace(MODEL, interior="absorbing", learned_tints=2)
     state = init_state(CONFIG.seed, config, CONFIG.schedule)
     before = jax.tree.map(
-        lambda x: _ParamsOfBefore(*x) if isinstance(x, Params) else x,
+        lambda x: _ParamsOfBefore(*x[:3]) if isinstance(x, Params) else x,
         state,
         is_leaf=lambda x: isinstance(x, Params),
     )

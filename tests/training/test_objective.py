@@ -4,9 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.test_util import check_grads
 
 from refref_jax.optics.light_paths import PathStatus
 from refref_jax.render.learned_media import BentRay
+from refref_jax.render.model import Params
 from refref_jax.render.pixels import Light
 from refref_jax.render.volume_rendering import Composite, Histogram, PathRadiance
 from refref_jax.training import objective
@@ -416,3 +418,75 @@ def test_losses_of_bent_rays_are_finite(scale):
     points = scale * np.random.default_rng(0).normal(size=(5, 3))
     bent = _bent_ray(places, points)
     assert gradients.all_finite((_deformation(bent), _deformation_slopes(bent)))
+
+
+# --- gains of images ---
+
+
+def _measured(gains, linear, target, views):
+    params = Params((), {}, None, jnp.asarray(gains))
+    zero = jnp.zeros((), jnp.asarray(gains).dtype)
+    totals = objective.Totals(jnp.asarray(linear), zero, zero, zero)
+    config = LossConfig(hash_decay=0.0)
+    return objective.measure(
+        params,
+        totals,
+        jnp.asarray(target),
+        jnp.zeros((len(linear), 3)),
+        config,
+        views=jnp.asarray(views),
+    ).loss
+
+
+def _gained(seed=0):
+    rng = np.random.default_rng(seed)
+    linear = rng.uniform(0.1, 0.6, (6, 3))
+    target = rng.uniform(0.1, 0.9, (6, 3))
+    return rng.normal(0.0, 0.2, (4, 3)), linear, target, np.array([0, 1, 1, 2, 0, 2])
+
+
+def test_gains_multiply_linear_light_and_their_geometric_mean_is_one():
+    gains, linear, target, views = _gained()
+    with jax.enable_x64(True):
+        found = objective.gains(Params((), {}, None, jnp.asarray(gains)))
+        loss = _measured(gains, linear, target, views)
+    factors = np.exp(gains - gains.mean(axis=0))
+    np.testing.assert_allclose(found, factors, rtol=1e-12)
+    np.testing.assert_allclose(np.exp(np.log(found).mean(axis=0)), 1.0, rtol=1e-12)
+    seen = factors[views] * linear  # above the knee of the transfer function
+    encoded = 1.055 * seen ** (1.0 / 2.4) - 0.055
+    assert float(loss) == pytest.approx(np.mean((encoded - target) ** 2), rel=1e-9)
+
+
+def test_a_gain_that_all_images_share_changes_nothing():
+    gains, linear, target, views = _gained()
+    with jax.enable_x64(True):
+        pair = [_measured(gains + shift, linear, target, views) for shift in (0.0, 0.7)]
+        slopes = jax.grad(_measured)(jnp.asarray(gains), linear, target, views)
+    assert float(pair[1]) == pytest.approx(float(pair[0]), rel=1e-12)
+    np.testing.assert_allclose(np.asarray(slopes).sum(axis=0), 0.0, atol=1e-12)
+
+
+def test_slopes_of_gains():
+    gains, linear, target, views = _gained(1)
+    with jax.enable_x64(True):
+        check_grads(
+            lambda x: _measured(x, linear, target, views),
+            (jnp.asarray(gains),),
+            order=1,
+            modes="rev",
+        )
+
+
+@pytest.mark.parametrize("extreme", [0.0, 1e-30, 1e4])
+def test_gains_of_black_and_of_glaring_pixels_stay_finite(extreme):
+    gains, _, target, views = _gained()
+    linear = np.full((6, 3), extreme, np.float32)
+    gains, target = gains.astype(np.float32), target.astype(np.float32)
+    value, slopes = jax.value_and_grad(_measured)(jnp.asarray(gains), linear, target, views)
+    assert np.isfinite(value) and np.all(np.isfinite(slopes))
+
+
+def test_parameters_without_gains_say_so():
+    with pytest.raises(ValueError, match="Train with exposure=per_image"):
+        objective.gains(Params((), {}))

@@ -98,6 +98,7 @@ def test_resolve_leaves_nothing_open_and_is_idempotent(found, given):
         left = straight and option.name == "reentry"
         unused = ("sub_spaces", "eikonal_weight", "curvature_weight", "gaussians", "splat_filter")
         left |= option.name in (*BACKDROP_ONLY, *SURFACE_ONLY, *unused, "deformation_weights")
+        left |= option.name == "exposure"  # of a field fixed, unless it is asked for
         assert left == (made.config.get(option.name) is None), option.name
         assert made.reasons[option.name]
     again = resolve(made.config, SceneFacts(found, CAMERAS, (), None, None, ()))
@@ -312,6 +313,17 @@ def test_resolve_warns_of_what_is_doubtful():
 def test_resolve_refuses_what_can_not_be(found, given, message):
     with pytest.raises(ValueError, match=message):
         _resolve(found, **given)
+
+
+def test_a_field_learns_the_exposure_of_each_image_if_it_is_asked_to():
+    resolved = _resolve(_EMPTY, exposure="per_image")
+    assert resolved.config.model.far_field == "field"
+    assert resolved.model.config.learned_gains == len(CAMERAS.poses)
+    assert "exposure=per_image" in resolved.describe()
+    assert _resolve(_EMPTY).model.config.learned_gains == 0
+    assert _resolve(_EMPTY, exposure="fixed").model.config.learned_gains == 0
+    with pytest.raises(ValueError, match=r"No effect on Gaussian splats.*exposure"):
+        _resolve(_EMPTY, exposure="per_image", field="splats")
 
 
 def test_override_takes_decisions_again_that_follow_from_a_change():

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import scipy.stats
 
+from experiments.captures import world
 from experiments.dataset import cameras
 from experiments.dataset.seeds import seed_of
-from refref_jax.data.nerfstudio import conversion
 from tests.processes.command import ROOT
 
 _BUNDLED = ROOT / "experiments" / "data" / "cube_smcvx_ball"
@@ -63,7 +63,7 @@ def test_the_helix_rises_from_minus_10_to_65_degrees_in_three_turns():
     # Half of three turns is on the other side, 27.5 degrees up.
     np.testing.assert_allclose(middle[:3, 3], [-3.548043301, 0.0, 1.846994453], atol=1e-8)
     np.testing.assert_allclose(last[:3, 3], [1.690473047, 0.0, 3.625231148], atol=1e-8)
-    assert conversion.USUAL_DISTANCE == cameras.CAMERA_RADIUS  # captures are scaled to it
+    assert world.USUAL_DISTANCE == cameras.CAMERA_RADIUS  # captures are scaled to it
 
 
 def test_the_bundled_scene_was_seen_from_the_helix():

@@ -38,6 +38,7 @@ from refref_jax.reconstruct.shapes import FixedShape, mesh_of
 from refref_jax.training.config import TrainConfig
 from tests.factories import bodies, scenes, vessels
 from tests.factories.silhouettes import RADIUS, without_masks, write_scene
+from tests.factories.small_scenes import write_grey
 
 pytestmark = [pytest.mark.longest, pytest.mark.computing]
 
@@ -598,6 +599,26 @@ def test_a_wrong_mask_is_named_unless_one_may_be_wrong(scene, tmp_path, outliers
         name = wrong.relative_to(spoilt).as_posix()
         assert taken.startswith(f"{name} alone carves away") and "--outliers=1" in taken
         assert facts.volume < 0.7 * true
+
+
+def test_views_without_the_object_are_left_out_and_counted(scene, tmp_path):
+    frames = scene_folder.read_frames(scene, "train")
+    trials = {name: shutil.copytree(scene, tmp_path / name) for name in ("black", "fewer")}
+    for name in ("train/r_003", "train/r_010", "test/r_001"):
+        write_grey(trials["black"] / "mask" / f"{name}.png", np.zeros((40, 40)))
+    path = trials["fewer"] / "transforms_train.json"
+    content = json.loads(path.read_text())
+    content["frames"] = [f for i, f in enumerate(content["frames"]) if i not in (3, 10)]
+    path.write_text(json.dumps(content))
+    said, found = [], {}
+    for name, folder in trials.items():
+        out = tmp_path / f"{name}_out"
+        found[name] = chain.reconstruct(folder, out, _CONFIG, compare=False, say=said.append)
+        found[f"{name}_mesh"] = next((out / "geometry").glob("*.ply")).read_bytes()
+    assert found["black"].geometry.masks == len(frames.names) - 2
+    assert found["black_mesh"] == found["fewer_mesh"]
+    assert [line for line in said if "2 training views are left out" in line] == said[1:2]
+    assert len(found["black"].report.overlaps) == 4
 
 
 def test_where_a_mask_removes_the_body_its_file_is_named(scene, tmp_path):

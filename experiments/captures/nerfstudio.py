@@ -1,11 +1,11 @@
 """Reads and writes captures in nerfstudio's `transforms.json` format (NumPy only).
 
     {source}/transforms.json    cameras, shared or in each frame; poses; names of files
-    {source}/images/...         PNG or JPEG
+    {source}/images/...         PNG, JPEG or EXR
     {source}/masks/...          one per image, or none at all; training ignores black pixels
 
-Cameras must be pinholes without distortion. Values that all frames share are at the top of the
-file; otherwise each frame has its own.
+Values that all frames share are at the top of the file; otherwise each frame has its own, as in the
+captures of Polycam and Record3D.
 
 The camera frame is that of this library (x right, y up, looking along -z), and so is the pixel
 frame: a principal point of half the width and half the height is the image's centre.
@@ -20,11 +20,19 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
+from experiments.captures.capture import (
+    Capture,
+    CaptureFrame,
+    PointCloud,
+    check_sizes,
+    read_points,
+)
+from experiments.captures.lenses import Distortion, Intrinsics
 from refref_jax import configuration
 from refref_jax.choices import SPLITS
 from refref_jax.data import SceneError, file_inside, image_files, scene_folder
@@ -33,55 +41,17 @@ from refref_jax.geometry.cameras import Cameras, focal_length
 MODEL = "OPENCV"
 """Camera model of captures that are written, without distortion."""
 
-_PINHOLES = (MODEL, "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+_RATIONAL = "FULL_OPENCV"
+_FISHEYES = ("OPENCV_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE")
+_PINHOLES = (MODEL, "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", _RATIONAL)
 
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
-"""Distortion coefficients of nerfstudio's models; all must be 0."""
+"""Distortion coefficients of nerfstudio's models."""
 
-_UNDISTORT = (
-    "Only pinholes without distortion can be used: undistort the images first, with `colmap "
-    "image_undistorter`, and convert its output (see docs/data_formats.md)."
-)
+# Coefficients that a model has not; nerfstudio's own readers disagree about them.
+_HAS_NOT = {MODEL: ("k4", "k5", "k6"), _RATIONAL: (), _FISHEYES[0]: ("k5", "k6", "p1", "p2")}
 
 FILE = "transforms.json"
-
-# Minimum grey level of white: JPEG adds grey pixels at every edge.
-_WHITE = 128
-
-
-class Intrinsics(NamedTuple):
-    """Intrinsics of a pinhole camera, in pixels.
-
-    Attributes:
-      focal_x, focal_y: focal lengths along rows and along columns.
-      centre_x, centre_y: principal point, from the upper left corner of the image.
-      width, height: size of the image.
-    """
-
-    focal_x: float
-    focal_y: float
-    centre_x: float
-    centre_y: float
-    width: int
-    height: int
-
-
-class CaptureFrame(NamedTuple):
-    """One image of a capture.
-
-    Attributes:
-      name: name of the image in the file.
-      image: path of a PNG or JPEG.
-      mask: path of a mask of the same size, or `None` if the frame has none.
-      pose: camera-to-world matrix in the file.
-      intrinsics: intrinsics of the camera.
-    """
-
-    name: str
-    image: Path
-    mask: Path | None
-    pose: Float[np.ndarray, "3 4"]
-    intrinsics: Intrinsics
 
 
 def read_frame(content: dict[str, Any], record: Any, path: Path) -> CaptureFrame:
@@ -93,8 +63,8 @@ def read_frame(content: dict[str, Any], record: Any, path: Path) -> CaptureFrame
       path: path of the file.
 
     Raises:
-      SceneError: if a file is missing, the pose is not a rigid motion, or the camera is not a
-        pinhole without distortion.
+      SceneError: if a file is missing, the pose is not a rigid motion, or the camera's model is
+        not known.
     """
     name = scene_folder.get_text(record, "file_path", path)
     # Instant NGP omits the extension.
@@ -104,7 +74,7 @@ def read_frame(content: dict[str, Any], record: Any, path: Path) -> CaptureFrame
     mask = None
     if "mask_path" in record:
         mask = file_inside([path.parent], record["mask_path"], where="mask_path", path=path)
-    _check_model(content, record, name, path)
+    distortion = _distortion(content, record, name, path)
     for file in (image, mask):
         if file is not None and not file.is_file():
             raise SceneError(
@@ -116,6 +86,7 @@ def read_frame(content: dict[str, Any], record: Any, path: Path) -> CaptureFrame
         mask=mask,
         pose=scene_folder.rigid_motion(matrix, name, path),
         intrinsics=_intrinsics(content, record, image, path),
+        distortion=distortion,
     )
 
 
@@ -138,19 +109,29 @@ def read_number(records: Sequence[dict[str, Any]], name: str, path: Path) -> flo
     return float(values[0]) if values else None
 
 
-def _check_model(content: dict[str, Any], record: dict[str, Any], name: str, path: Path) -> None:
+def _distortion(
+    content: dict[str, Any], record: dict[str, Any], name: str, path: Path
+) -> Distortion:
     both = (content, record)
-    for each in both:
-        model = each.get("camera_model", MODEL)
-        if model not in _PINHOLES or each.get("is_fisheye", False):
-            wrong = model if model not in _PINHOLES else "a fisheye"
-            raise SceneError(f"The camera of {name} in {path} is {wrong}. {_UNDISTORT}")
-    for key in DISTORTION:
-        value = read_number(both, key, path)
-        if value:
+    model = record.get("camera_model", content.get("camera_model", MODEL))
+    if any(each.get("is_fisheye", False) for each in both):
+        model = _FISHEYES[0]
+    if model not in (*_PINHOLES, *_FISHEYES):
+        shown = configuration.abridged(model)
+        raise SceneError(
+            f"The camera of {name} in {path} is {shown}, which is not read. Read are "
+            f"{', '.join((*_PINHOLES, *_FISHEYES))}: export pinhole images."
+        )
+    values = {key: read_number(both, key, path) or 0.0 for key in (*DISTORTION, "k5", "k6")}
+    family = _FISHEYES[0] if model in _FISHEYES else model if model == _RATIONAL else MODEL
+    for key in _HAS_NOT[family]:
+        if values[key]:
             raise SceneError(
-                f"The camera of {name} in {path} has distortion, {key} = {value:g}. {_UNDISTORT}"
+                f"The camera of {name} in {path} is {model} with {key} = {values[key]:g}, "
+                f"which {family} does not have. Remove it, or name the model that has it."
             )
+    radial = tuple(values[f"k{number}"] for number in range(1, 7))
+    return Distortion(model in _FISHEYES, radial, (values["p1"], values["p2"]))
 
 
 def _intrinsics(
@@ -196,24 +177,6 @@ def _focal(
     )
 
 
-class Capture(NamedTuple):
-    """Content of a `transforms.json`, as far as it is used here.
-
-    Attributes:
-      frames: frames, ordered by name.
-      splits: numbers of the frames of `train`, `val` and `test`, or `None` if the file lists none.
-      applied: rotation and translation that were applied to the original poses.
-      applied_scale: scale that was applied after that.
-      has_depth: whether frames name depth maps, which are not read.
-    """
-
-    frames: tuple[CaptureFrame, ...]
-    splits: dict[str, tuple[int, ...]] | None
-    applied: Float[np.ndarray, "3 4"]
-    applied_scale: float
-    has_depth: bool
-
-
 def read_capture(source: Path) -> Capture:
     """Reads a capture, and the size of each of its images, but no pixels.
 
@@ -221,8 +184,8 @@ def read_capture(source: Path) -> Capture:
       source: folder of a `transforms.json`, or path of such a file with any name.
 
     Raises:
-      SceneError: if a file is missing or broken, if a pose is not a rigid motion, if a camera is
-        not a pinhole without distortion, or if some frames have a mask and others have none.
+      SceneError: if a file is missing or broken, if a pose is not a rigid motion, if the model of a
+        camera is not known, or if some frames have a mask and others have none.
     """
     path = source if source.suffix == ".json" else source / FILE
     if not path.is_file():
@@ -241,6 +204,7 @@ def read_capture(source: Path) -> Capture:
         (read_frame(content, record, path) for record in records), key=lambda frame: frame.name
     )
     _check_masks(frames, path)
+    check_sizes(frames)
     scale = read_number([content], "applied_scale", path)
     if scale is not None and not scale > 0.0:
         raise SceneError(f"applied_scale is {scale:g} in {path}. Give a positive number.")
@@ -250,35 +214,17 @@ def read_capture(source: Path) -> Capture:
         applied=_applied_transform(content, path),
         applied_scale=1.0 if scale is None else scale,
         has_depth=any("depth_file_path" in record for record in records),
+        points=_points(content, path),
     )
 
 
-def every_nth(frames: int, *, every: int) -> dict[str, tuple[int, ...]]:
-    """Returns splits for a capture that lists none: every n-th frame, from the first, is test.
-
-    nerfstudio's evaluation mode `interval` does the same.
-
-    Args:
-      frames: number of frames.
-      every: value of n, at least 2.
-
-    Raises:
-      SceneError: if no frame is left to train on.
-    """
-    train = tuple(number for number in range(frames) if number % every)
-    if not train:
-        raise SceneError(
-            f"There is {frames} frame, and the first of every {every} is for testing, so none is "
-            "left for training. Capture more images."
-        )
-    return {"train": train, "test": tuple(range(0, frames, every))}
-
-
-def read_capture_mask(path: Path) -> Bool[np.ndarray, "h w"]:
-    """Returns the pixels of a mask that are not black; JPEG masks are thresholded at mid-grey."""
-    if path.suffix.lower() in (".jpg", ".jpeg"):
-        return image_files.read_rgb(path).max(axis=-1) >= _WHITE
-    return image_files.read_mask(path)
+def _points(content: dict[str, Any], path: Path) -> PointCloud | None:
+    """Returns the points that a file names; they are in the world of its poses."""
+    if content.get("ply_file_path") is None:
+        return None
+    name = scene_folder.get_text(content, "ply_file_path", path)
+    file = file_inside([path.parent], name, where="ply_file_path", path=path)
+    return read_points(file) if file.is_file() else None
 
 
 def write_capture(

@@ -1,0 +1,1 @@
+"""Captures of other programs: reading, conversion to scene folders, and writing."""

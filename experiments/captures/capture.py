@@ -1,0 +1,178 @@
+"""A capture of any program: photographs with lenses, poses and masks, before it becomes a scene."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import trimesh
+from jaxtyping import Bool, Float, UInt8
+
+from experiments.captures.lenses import Distortion, Intrinsics, Lens
+from refref_jax.data import SceneError, image_files
+
+# Minimum grey level of white: JPEG adds grey pixels at every edge.
+_WHITE = 128
+
+
+class CaptureFrame(NamedTuple):
+    """One image of a capture.
+
+    Attributes:
+      name: name of the image in the file.
+      image: path of the image.
+      mask: path of a mask of the same size, or `None` if the frame has none.
+      pose: camera-to-world matrix in the file.
+      intrinsics: intrinsics of the camera.
+      distortion: distortion of its lens.
+    """
+
+    name: str
+    image: Path
+    mask: Path | None
+    pose: Float[np.ndarray, "3 4"]
+    intrinsics: Intrinsics
+    distortion: Distortion = Distortion()
+
+    @property
+    def lens(self) -> Lens:
+        """Intrinsics and distortion together."""
+        return Lens(self.intrinsics, self.distortion)
+
+
+class PointCloud(NamedTuple):
+    """Points that the program found.
+
+    Attributes:
+      positions: positions in the world of the file.
+      colours: sRGB.
+    """
+
+    positions: Float[np.ndarray, "points 3"]
+    colours: UInt8[np.ndarray, "points 3"]
+
+
+class Capture(NamedTuple):
+    """Content of a capture, as far as it is used here.
+
+    Attributes:
+      frames: frames, ordered by name.
+      splits: numbers of the frames of `train`, `val` and `test`, or `None` if the file lists none.
+      applied: rotation and translation that were applied to the original poses.
+      applied_scale: scale that was applied after that.
+      has_depth: whether frames name depth maps, which are not read.
+      points: points of the capture, or `None` without any.
+    """
+
+    frames: tuple[CaptureFrame, ...]
+    splits: dict[str, tuple[int, ...]] | None
+    applied: Float[np.ndarray, "3 4"]
+    applied_scale: float
+    has_depth: bool
+    points: PointCloud | None = None
+
+
+def every_nth(frames: int, *, every: int) -> dict[str, tuple[int, ...]]:
+    """Returns splits for a capture that lists none: every n-th frame, from the first, is test.
+
+    nerfstudio's evaluation mode `interval` does the same.
+
+    Args:
+      frames: number of frames.
+      every: value of n, at least 2.
+
+    Raises:
+      SceneError: if no frame is left to train on.
+    """
+    train = tuple(number for number in range(frames) if number % every)
+    if not train:
+        raise SceneError(
+            f"There is {frames} frame, and the first of every {every} is for testing, so none is "
+            "left for training. Capture more images."
+        )
+    return {"train": train, "test": tuple(range(0, frames, every))}
+
+
+def with_masks(capture: Capture, folder: Path) -> tuple[Capture, tuple[str, ...]]:
+    """Returns a capture with the masks of a folder, and the names of the frames without any.
+
+    The mask of `photo.jpg` is `photo.jpg.png`, as in COLMAP, or `photo.png`, in the same subfolder.
+
+    Raises:
+      SceneError: if no frame has one, or one has another size than its image.
+    """
+    found, lacking = [], []
+    for frame in capture.frames:
+        name = Path(frame.name)
+        # nerfstudio's names begin with the folder of the images.
+        tries = [folder / part for part in (name, Path(*name.parts[1:])) if part.parts]
+        files = [each.with_name(each.name + ".png") for each in tries]
+        files += [each.with_suffix(".png") for each in tries]
+        mask = next((file for file in files if file.is_file()), None)
+        if mask is None:
+            lacking.append(frame.name)
+        found.append(frame._replace(mask=mask))
+    if len(lacking) == len(found):
+        raise SceneError(
+            f"{folder} has no mask of {lacking[0]}, nor of any other image. Name the masks like "
+            "the images, with the ending .png."
+        )
+    check_sizes(found)
+    return capture._replace(frames=tuple(found)), tuple(lacking)
+
+
+def check_sizes(frames: Sequence[CaptureFrame]) -> None:
+    """Checks the sizes of masks by their headers.
+
+    Raises:
+      SceneError: if a mask is broken, or has another size than its image.
+    """
+    for frame in frames:
+        if frame.mask is None:
+            continue
+        height, width = image_files.read_size(frame.mask)
+        if (width, height) != frame.intrinsics[4:]:
+            raise SceneError(
+                f"The mask {frame.mask} is {width} x {height} pixels, but its image "
+                f"{frame.intrinsics.width} x {frame.intrinsics.height}. Resize it without "
+                "interpolation."
+            )
+
+
+def read_mask(path: Path, *, white: str) -> Bool[np.ndarray, "h w"]:
+    """Returns the pixels of the object; JPEG masks are thresholded at mid-grey.
+
+    Args:
+      path: path of the mask.
+      white: what is white, `object` or `background`.
+    """
+    if path.suffix.lower() in (".jpg", ".jpeg"):
+        marked = image_files.read_rgb(path).max(axis=-1) >= _WHITE
+    else:
+        marked = image_files.read_mask(path)
+    return marked if white == "object" else ~marked
+
+
+def read_points(path: Path) -> PointCloud:
+    """Reads the points of a PLY; they are grey if they have no colours.
+
+    Raises:
+      SceneError: if it cannot be read.
+    """
+    try:
+        cloud = trimesh.load(path, process=False)
+        positions = np.asarray(cloud.vertices, np.float64)
+        colours = np.asarray(getattr(cloud, "colors", np.empty((0, 4))), np.uint8)
+    except Exception as error:  # trimesh raises whatever its readers do
+        raise SceneError(
+            f"{path} cannot be read as a PLY of points ({error}). Copy it again, or remove "
+            "ply_file_path."
+        ) from error
+    if colours.shape[:1] != positions.shape[:1]:
+        colours = np.full((len(positions), 3), 128, np.uint8)
+    return PointCloud(positions, colours[:, :3])
+
+
+def write_points(path: Path, points: PointCloud) -> None:
+    """Writes points as PLY."""
+    trimesh.PointCloud(points.positions, colors=points.colours).export(path)

@@ -1,1 +1,0 @@
-"""Captures in nerfstudio's format: reading, conversion to scene folders, and writing."""
