@@ -28,7 +28,7 @@ with epy.lazy_imports():
     from experiments.figures import comparison
     from experiments.r3f import object_source
     from experiments.runs import evaluation as reporting
-    from experiments.runs import perceptual
+    from experiments.runs import perceptual, residuals
     from refref_jax.data import image_files, scene_names
     from refref_jax.fields import registry
     from refref_jax.render import checkpoint_io
@@ -72,8 +72,8 @@ def main() -> None:
         "rays_per_pixel": _RAYS_PER_PIXEL.value,
     }
     with outputs.fresh(out, **place) as draft:
-        found, views = evaluate(model, scene, draft, lpips)
-        summary = sources | found._asdict()
+        found, views, told = evaluate(model, scene, draft, lpips)
+        summary = sources | found._asdict() | {"warnings": told}
         text = json.dumps(configuration.string_safe(summary), indent=2, allow_nan=False)
         (draft / "metrics.json").write_text(text + "\n", encoding="utf-8")
         comparison.write_comparison(draft / "comparison.png", views)
@@ -83,6 +83,8 @@ def main() -> None:
         summary["results"]["dropped"],
         advice="Train with a larger --min_throughput or a smaller --max_bends.",
     )
+    for sentence in told:
+        print(f"warning: {sentence}")
     print(f"Images:   {out / 'comparison.png'}, {out / 'rgb'}, {out / 'distance'}")
     print(f"Metrics:  {out / 'metrics.json'}")
     print(f"Next: {app.shell('render', f'--run={run}', '--views=orbit')}")
@@ -99,19 +101,27 @@ def _method(run: Path, paths: str, field: str) -> str:
 
 def evaluate(
     model: Model, scene: Path, out: Path, lpips: evaluation.Perceptual
-) -> tuple[evaluation.Evaluation, list[comparison.Comparison]]:
-    """Evaluates a model, and writes each image as soon as it is rendered."""
+) -> tuple[evaluation.Evaluation, list[comparison.Comparison], tuple[str, ...]]:
+    """Evaluates a model, and writes each image as soon as it is rendered.
+
+    Returns:
+      The metrics, the views that are shown, and what the residuals look like.
+    """
     for folder in ("rgb", "distance"):
         (out / folder).mkdir()
     views: list[comparison.Comparison] = []
+    errors: list[residuals.Residuals] = []
     bars: list[ProgressBar] = []
 
     def write(view: evaluation.EvaluatedView) -> None:
         seen = view.rendering
         image_files.write_rgb(out / "rgb" / f"{view.name}.png", seen.rgb)
         image_files.write_exr(out / "distance" / f"{view.name}.exr", seen.distance)
+        target = view.target / 255.0
+        error = residuals.of_view(seen.rgb, target, view.mask)
+        bends = model.settings.max_bends > 0
+        errors.append(error if bends else error._replace(inside=None, rim=None))
         if view.place in reporting.shown_views(view.count):
-            target = view.target / 255.0
             views.append(comparison.Comparison(view.name, target, seen.rgb, seen.distance))
 
     with contextlib.ExitStack() as stack:
@@ -132,7 +142,7 @@ def evaluate(
             progress=progress,
             on_view=write,
         )
-    return found, views
+    return found, views, residuals.tell(errors)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NoReturn
 
-from experiments.r3f import geometry_stage, index_stage, light_stage, object_source, records, report
+from experiments.r3f import (
+    field_surface,
+    geometry_stage,
+    index_stage,
+    light_stage,
+    object_source,
+    records,
+    report,
+)
 from experiments.r3f.records import IndexFacts, LightFacts, Reconstruction, ReconstructionConfig
 from refref_jax import atomic_files, configuration
 from refref_jax.choices import Position, Space
@@ -43,18 +51,16 @@ def reconstruct(
         installed, if no object fits the masks, or if the folder contains anything else.
     """
     import_skimage()
-    masks = len(scene_folder.read_masks(scene_folder.read_frames(scene, "train")))
-    if config.outliers >= masks:
-        raise ValueError(
-            f"--outliers={config.outliers}, but there are {masks} train masks. Use fewer."
-        )
-    _read_held_out_masks(scene)
+    if config.geometry != field_surface.NAME or field_surface.has_masks(scene):
+        _check_masks(scene, config)
     asked = Reconstruction(scene_names.of_folder(scene), fingerprint(scene), config)
     found = records.begin(out, asked)
     with atomic_files.hold(out):
         found = records.read(out)  # another process may have finished it meanwhile
+        scene = field_surface.masked_scene(scene, out, config)
         if found.geometry is None or not geometry_stage.is_there(out, found.geometry):
-            say(f"geometry: {config.geometry} of the training masks, {config.resolution} cells")
+            read = "images" if config.geometry == field_surface.NAME else "masks"
+            say(f"geometry: {config.geometry} of the training {read}, {config.resolution} cells")
             facts = geometry_stage.run(scene, out, config)
             found = dataclasses.replace(found, geometry=facts, index=None, light=None, report=None)
             records.write(out, found)
@@ -72,8 +78,13 @@ def reconstruct(
     return found
 
 
-def _read_held_out_masks(scene: Path) -> None:
-    """Reads masks that judge, so that broken files are reported now, not after hours."""
+def _check_masks(scene: Path, config: ReconstructionConfig) -> None:
+    """Reads all masks, also those that judge: broken files are reported now, not after hours."""
+    masks = len(scene_folder.read_masks(scene_folder.read_frames(scene, "train")))
+    if config.outliers >= masks:
+        raise ValueError(
+            f"--outliers={config.outliers}, but there are {masks} train masks. Use fewer."
+        )
     for split in ("val", "test"):
         if (scene / f"transforms_{split}.json").is_file():
             frames = scene_folder.read_frames(scene, split)

@@ -1,14 +1,16 @@
-"""Reconstructs the surface from the masks of the training views, the first stage of R3F.
+"""Reconstructs the surface from masks, or from a field of the images, the first stage of R3F.
 
 `about_masks` names the masks with which the surface disagrees.
 """
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from experiments.cli.progress import ProgressBar
+from experiments.r3f import field_surface
 from experiments.r3f.records import GeometryFacts, ReconstructionConfig
 from refref_jax import atomic_files
 from refref_jax.data import meshes, scene_folder, scene_names
@@ -37,18 +39,33 @@ _NAMED = 5
 _MUCH = 0.05
 
 
-def _hull(views: Views, names: Sequence[str], config: ReconstructionConfig) -> Grid:
+class Inputs(NamedTuple):
+    """What a surface is made of.
+
+    Attributes:
+      scene: folder of the scene.
+      out: folder of the reconstruction.
+      views: masks of the training views.
+      names: names of the masks.
+    """
+
+    scene: Path
+    out: Path
+    views: Views
+    names: Sequence[str]
+
+
+def _hull(inputs: Inputs, config: ReconstructionConfig) -> Grid:
     return visual_hull.carve(
-        *views, resolution=config.resolution, outliers=config.outliers, names=names
+        *inputs.views, resolution=config.resolution, outliers=config.outliers, names=inputs.names
     )
 
 
-def _occupancy(views: Views, names: Sequence[str], config: ReconstructionConfig) -> Grid:
-    del names
+def _occupancy(inputs: Inputs, config: ReconstructionConfig) -> Grid:
     settings = OccupancyTrainingConfig()
     with ProgressBar("occupancy", settings.steps) as bar:
         return occupancy.fit(
-            *views,
+            *inputs.views,
             config=settings,
             seed=config.seed,
             resolution=config.resolution,
@@ -56,11 +73,16 @@ def _occupancy(views: Views, names: Sequence[str], config: ReconstructionConfig)
         )
 
 
-GEOMETRIES: dict[str, Callable[[Views, Sequence[str], ReconstructionConfig], Grid]] = {
+def _neus(inputs: Inputs, config: ReconstructionConfig) -> Grid:
+    return field_surface.find(inputs.scene, inputs.out, config)
+
+
+GEOMETRIES: dict[str, Callable[[Inputs, ReconstructionConfig], Grid]] = {
     "hull": _hull,
     "occupancy": _occupancy,
+    field_surface.NAME: _neus,
 }
-"""Methods by name, which turn masks into a grid that is negative inside the object."""
+"""Methods by name, whose grid is negative inside the object."""
 
 
 def run(scene: Path, out: Path, config: ReconstructionConfig) -> GeometryFacts:
@@ -72,7 +94,7 @@ def run(scene: Path, out: Path, config: ReconstructionConfig) -> GeometryFacts:
     frames = scene_folder.read_frames(scene, "train")
     views = Views(scene_folder.read_masks(frames), frames.cameras)
     names = [_within(path, scene).as_posix() for path in frames.masks]
-    cut = find_isosurface(GEOMETRIES[config.geometry](views, names, config))
+    cut = find_isosurface(GEOMETRIES[config.geometry](Inputs(scene, out, views, names), config))
     trusted = without_outliers(cut, views, config.outliers)
     refined = refine(cut, Refinement(), views=trusted)
     mesh = refined[-1].mesh
@@ -90,7 +112,10 @@ def run(scene: Path, out: Path, config: ReconstructionConfig) -> GeometryFacts:
             if not np.array_equal(before.vertices, stage.mesh.vertices)
         ),
         refused=tuple(f"{stage.name}: {stage.refused}" for stage in refined if stage.refused),
-        warnings=about_masks(mesh, views, names, outliers=config.outliers),
+        warnings=(
+            *field_surface.warnings(scene, out),
+            *about_masks(mesh, views, names, outliers=config.outliers),
+        ),
     )
 
 

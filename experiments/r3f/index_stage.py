@@ -258,8 +258,18 @@ def _resolved(scene: Path, run: Path, steps: int, **given: Any) -> Resolved:
     return resolve(config.override(**field), facts)
 
 
-def _learned(scene: Path, run: Path, wanted: Resolved) -> Model:
-    """Learns the background, or resumes it."""
+def learned(scene: Path, run: Path, wanted: Resolved) -> Model:
+    """Trains a model of a scene without objects, or resumes its training.
+
+    Args:
+      scene: folder of the scene.
+      run: folder of the run.
+      wanted: resolved options.
+
+    Raises:
+      ValueError: if the training was started with another model.
+      KeyboardInterrupt: if its training was stopped; it has been saved.
+    """
     if not run_folder.exists(run):
         empty = assemble_scene([], [], rule="nested")
         run_folder.create(run, wanted.config, wanted.model, empty)
@@ -275,7 +285,12 @@ def _learned(scene: Path, run: Path, wanted: Resolved) -> Model:
         )
     if not ended:
         raise KeyboardInterrupt
-    model = checkpoint_io.load_model(run)
+    return checkpoint_io.load_model(run)
+
+
+def _learned(scene: Path, run: Path, wanted: Resolved) -> Model:
+    """Learns the background, or resumes it."""
+    model = learned(scene, run, wanted)
     return model._replace(config=_as_background(model.config))
 
 
@@ -290,7 +305,7 @@ def _as_background(config: ModelConfig) -> ModelConfig:
 
 
 def _refuse_another(run: Path, found: SavedModel, wanted: SavedModel) -> None:
-    """Rejects a background that was started with another model."""
+    """Rejects a run that was started with another model."""
     theirs, ours = _as_background(found.config), _as_background(wanted.config)
     if (theirs, found.settings) == (ours, wanted.settings):
         return

@@ -451,6 +451,7 @@ def _attenuated(block: Block, tints: LearnedTints) -> Block:
     return block._replace(lookups=lookups)
 
 
+@jax.jit
 def sum_of(parts: Sequence[_Arrays]) -> _Arrays:
     """Returns the sum of records of arrays."""
     return jax.tree.map(lambda *x: functools.reduce(jnp.add, x), *parts)

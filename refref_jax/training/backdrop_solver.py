@@ -148,22 +148,56 @@ def _add_scaled(a: _Arrays, scale: Float[Array, "3"], b: _Arrays) -> _Arrays:
     return jax.tree.map(add, a, b)
 
 
+class _Priors(NamedTuple):
+    """What is known of the unknowns without the pixels.
+
+    Attributes:
+      weights: weight of the difference from `usual`.
+      usual: value of unknowns that no pixel sees: the mean of all pixels, and gains of 1.
+      held: weight of the difference from the start, for pixels of earlier rounds; 0 without them.
+    """
+
+    weights: Unknowns
+    usual: Unknowns
+    held: Unknowns
+
+
+class _Search(NamedTuple):
+    """State of conjugate gradients: `rho` is the residual's product with itself over the diagonal.
+
+    Each channel is a system of its own.
+    """
+
+    x: Unknowns
+    residual: Unknowns
+    direction: Unknowns
+    rho: Float[Array, "3"]
+
+
 @jax.jit
-def _begin_search(residual: Unknowns, diagonal: Unknowns) -> tuple[Unknowns, Array]:
+def _begin_search(
+    x: Unknowns, gradient: Unknowns, scales: Unknowns, priors: _Priors
+) -> tuple[_Search, Unknowns, Unknowns]:
+    """Returns the state before the first step, the weights of the priors, and the diagonal.
+
+    The pixels add their negative gradient and the scales of the unknowns.
+    """
+    ridge = jax.tree.map(jnp.add, priors.weights, priors.held)
+    diagonal = jax.tree.map(jnp.add, scales, ridge)
+    residual = jax.tree.map(
+        lambda a, weight, b, c: a - weight * (b - c), gradient, priors.weights, x, priors.usual
+    )
     direction = jax.tree.map(jnp.divide, residual, diagonal)
-    return direction, _dot(residual, direction)
+    return _Search(x, residual, direction, _dot(residual, direction)), ridge, diagonal
 
 
 @jax.jit
 def _advance(
-    x: Unknowns,
-    residual: Unknowns,
-    direction: Unknowns,
-    image: Unknowns,
-    diagonal: Unknowns,
-    rho: Array,
-) -> tuple[Unknowns, Unknowns, Unknowns, Array, Array]:
-    """Takes one step of conjugate gradients; each channel is a system of its own."""
+    state: _Search, image: Unknowns, ridge: Unknowns, diagonal: Unknowns
+) -> tuple[_Search, Float[Array, "3"]]:
+    """Takes one step, given what the pixels make of its direction; returns its length, too."""
+    x, residual, direction, rho = state
+    image = jax.tree.map(lambda a, weight, b: a + weight * b, image, ridge, direction)
     curvature = _dot(direction, image)
     alpha = jnp.where(curvature > 0.0, rho / jnp.where(curvature > 0.0, curvature, 1.0), 0.0)
     x = _add_scaled(x, alpha, direction)
@@ -172,7 +206,7 @@ def _advance(
     after = _dot(residual, scaled)
     beta = jnp.where(rho > 0.0, after / jnp.where(rho > 0.0, rho, 1.0), 0.0)
     direction = _add_scaled(scaled, beta, direction)
-    return x, residual, direction, after, alpha
+    return _Search(x, residual, direction, after), alpha
 
 
 def solve(
@@ -312,20 +346,6 @@ def _round(
     return state, before
 
 
-class _Priors(NamedTuple):
-    """What is known of the unknowns without the pixels.
-
-    Attributes:
-      weights: weight of the difference from `usual`.
-      usual: value of unknowns that no pixel sees: the mean of all pixels, and gains of 1.
-      held: weight of the difference from the start, for pixels of earlier rounds; 0 without them.
-    """
-
-    weights: Unknowns
-    usual: Unknowns
-    held: Unknowns
-
-
 def _priors(system: System, uniform: Pyramid, prior: float, held: Pyramid | None) -> _Priors:
     each = [prior if i else 1e-2 * prior for i in range(len(uniform))]
     extra = uniform[0].shape[-1] - 3
@@ -350,11 +370,7 @@ def _add_seen(held: Pyramid | None, seen: Pyramid) -> Pyramid:
 
 
 def _search(
-    system: System,
-    levels: Pyramid,
-    weights: list[Array],
-    seen: list[Array],
-    priors: _Priors,
+    system: System, levels: Pyramid, weights: list[Array], seen: list[Array], priors: _Priors
 ) -> Iterator[tuple[Unknowns, list[Array]]]:
     """Yields the unknowns, and the colours of the pixels, after each step of conjugate gradients.
 
@@ -366,24 +382,15 @@ def _search(
       priors: what is known without the pixels.
     """
     blocks, x = system.blocks, system.present(levels)
-    ridge = jax.tree.map(jnp.add, priors.weights, priors.held)
-    diagonal = jax.tree.map(jnp.add, system.diagonal(weights), ridge)
     gap = [w * (b.linear - s) for w, b, s in zip(weights, blocks, seen, strict=True)]
-    residual = jax.tree.map(
-        lambda a, weight, b, c: a - weight * (b - c),
-        system.transpose(gap),
-        priors.weights,
-        x,
-        priors.usual,
-    )
-    direction, rho = _begin_search(residual, diagonal)
+    gradient, scales = system.transpose(gap), system.diagonal(weights)
+    state, ridge, diagonal = _begin_search(x, gradient, scales, priors)
     while True:
-        moved = system.change(direction)
+        moved = system.change(state.direction)
         image = system.transpose([w * m for w, m in zip(weights, moved, strict=True)])
-        image = jax.tree.map(lambda a, weight, b: a + weight * b, image, ridge, direction)
-        x, residual, direction, rho, alpha = _advance(x, residual, direction, image, diagonal, rho)
+        state, alpha = _advance(state, image, ridge, diagonal)
         seen = _add_scaled(seen, alpha, moved)
-        yield x, seen
+        yield state.x, seen
 
 
 def _thinned(blocks: Sequence[Block], vertices: int) -> Sequence[Block]:

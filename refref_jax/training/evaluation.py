@@ -40,6 +40,8 @@ Measured = dict[str, float | None]
 # Compiled as a whole, which is faster than op by op.
 _lpips = jax.jit(metrics.lpips)
 
+_DISTANCE_ERRORS = {"mae": metrics.mean_absolute_error, "rmse": metrics.root_mean_square_error}
+
 
 class Truth(NamedTuple):
     """True images of a split; masks and distances may be missing."""
@@ -75,6 +77,7 @@ class EvaluatedView(NamedTuple):
       target: true image, 8-bit sRGB.
       rendering: rendered image.
       measures: metrics of the image, and the `seconds` that rendering took.
+      mask: mask of the object, if there is one.
     """
 
     name: str
@@ -83,6 +86,7 @@ class EvaluatedView(NamedTuple):
     target: UInt8[np.ndarray, "h w 3"]
     rendering: Rendering
     measures: Measured
+    mask: Bool[np.ndarray, "h w"] | None = None
 
 
 class Evaluation(NamedTuple):
@@ -150,8 +154,8 @@ def evaluate(
         measured["seconds"] = seconds
         per_image.append({"name": name, **measured})
         if on_view is not None:
-            target = truth.images[i]
-            on_view(EvaluatedView(name, place, len(chosen), target, seen, measured))
+            target, mask = truth.images[i], None if truth.masks is None else truth.masks[i]
+            on_view(EvaluatedView(name, place, len(chosen), target, seen, measured, mask))
         if progress is not None:
             progress(place + 1, len(chosen), f"{name}  PSNR {measured['psnr']:.2f}")
     results = {key: mean_of(per_image, key) for key in per_image[0] if key != "name"}
@@ -277,17 +281,34 @@ def measure_colours(
     with jax.enable_x64(True), jax.default_device(_device_of_doubles()):
         pair: tuple[Array, Array]
         pair = jax.device_put((rendered.astype(np.float64), target.astype(np.float64)))
-        result["psnr"] = float(metrics.psnr(*pair))
-        if mask is not None and mask.any():
-            result["psnr_masked"] = float(metrics.psnr_masked(*pair, jax.device_put(mask)))
-        if shortest >= metrics.SMALLEST_FOR_SSIM:
-            result["ssim"] = float(metrics.ssim(*pair))
+        area = jax.device_put(mask) if mask is not None and mask.any() else None
+        result |= {key: float(value) for key, value in _colour_measures(*pair, area).items()}
     if perceptual.lpips is not None and shortest >= metrics.SMALLEST_FOR_LPIPS:
         pair = jax.device_put((rendered.astype(np.float32), target.astype(np.float32)))
         result["lpips"] = float(_lpips(perceptual.lpips, *pair))
     if perceptual.flip is not None:
         result["flip"] = perceptual.flip(rendered, target)
     return result
+
+
+@jax.jit
+def _colour_measures(
+    rendered: Float[Array, "h w 3"], target: Float[Array, "h w 3"], mask: Bool[Array, "h w"] | None
+) -> dict[str, Float[Array, ""]]:
+    """Returns the metrics that are defined for the image, without perceptual ones."""
+    found = {"psnr": metrics.psnr(rendered, target)}
+    if mask is not None:
+        found["psnr_masked"] = metrics.psnr_masked(rendered, target, mask)
+    if min(target.shape[:2]) >= metrics.SMALLEST_FOR_SSIM:
+        found["ssim"] = metrics.ssim(rendered, target)
+    return found
+
+
+@jax.jit
+def _distance_measures(
+    seen: Float[Array, "h w"], true: Float[Array, "h w"], area: Bool[Array, "h w"]
+) -> dict[str, Float[Array, ""]]:
+    return {key: error(seen, true, area) for key, error in _DISTANCE_ERRORS.items()}
 
 
 def measure_distances(
@@ -304,20 +325,19 @@ def measure_distances(
       true: true distances, `inf` where there is none; `None` if unknown.
       mask: mask of the object; masked errors are `None` without one, or if it is empty.
     """
-    keys = {"mae": metrics.mean_absolute_error, "rmse": metrics.root_mean_square_error}
-    result: Measured = {f"{name}_{key}{area}": None for key in keys for area in ("", "_masked")}
+    areas = ("", "_masked")
+    result: Measured = {f"{name}_{key}{area}": None for key in _DISTANCE_ERRORS for area in areas}
     if seen is None or true is None:
         return result
     known = np.isfinite(true)
-    areas = {"": known, "_masked": known & (False if mask is None else mask)}
+    masked = known & (False if mask is None else mask)
     with jax.enable_x64(True), jax.default_device(_device_of_doubles()):
         pair: tuple[Array, Array]
         pair = jax.device_put((seen.astype(np.float64), true.astype(np.float64)))
-        for suffix, area in areas.items():
+        for suffix, area in zip(areas, (known, masked), strict=True):
             if area.any():
-                area = jax.device_put(area)
-                for key, error in keys.items():
-                    result[f"{name}_{key}{suffix}"] = float(error(*pair, area))
+                found = _distance_measures(*pair, jax.device_put(area))
+                result |= {f"{name}_{key}{suffix}": float(value) for key, value in found.items()}
     return result
 
 

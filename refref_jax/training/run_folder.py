@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 from jaxtyping import Float
@@ -81,7 +80,8 @@ class Checkpoints:
         step = int(state.step)
         if step == self.newest():
             return
-        if not all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(state.params)):
+        leaves = jax.tree.leaves(state.params)
+        if not all(np.all(np.isfinite(leaf)) for leaf in jax.device_get(leaves)):
             raise ValueError(
                 f"Parameters are not finite at step {step}, so no checkpoint is written. Evaluate "
                 "an earlier one, or train again with another seed, in another folder."
