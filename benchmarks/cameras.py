@@ -32,7 +32,6 @@ from jaxtyping import Bool, Float, UInt8
 from experiments.cameras import bundle, refined_scene, refinement
 from experiments.cameras.bundle import Prior, Views
 from experiments.cameras.refinement import Photo
-from experiments.dataset import captures, handheld
 from refref_jax.data import image_files
 
 _CAPTURES = flags.DEFINE_list("captures", None, "Folders of make_capture.", required=True)
@@ -87,13 +86,13 @@ class Generated(NamedTuple):
 
 def read(folder: Path) -> Generated:
     """Reads a folder of `make_capture`."""
-    files = (folder / captures.TRUTH / "truth.json", folder / captures.CAPTURE / "transforms.json")
+    files = (folder / "truth" / "truth.json", folder / "capture" / "transforms.json")
     return Generated(folder, *(json.loads(path.read_text(encoding="utf-8")) for path in files))
 
 
 def perfect_photos(made: Generated) -> list[Photo]:
     """Returns the images without faults."""
-    scene = made.folder / captures.PERFECT
+    scene = made.folder / "perfect"
     names = [frame["perfect"].removeprefix("./") + ".png" for frame in made.truth["frames"]]
     return [
         Photo(image_files.read_rgb(scene / name), image_files.read_mask(scene / "mask" / name))
@@ -103,7 +102,7 @@ def perfect_photos(made: Generated) -> list[Photo]:
 
 def flat_photos(made: Generated) -> list[Photo]:
     """Returns the photographs as a pinhole of the same focal length would show them."""
-    capture, lens = made.folder / captures.CAPTURE, handheld.Lens(**made.truth["lens"])
+    capture, lens = made.folder / "capture", made.truth["lens"]
     photos = []
     for frame in made.given["frames"]:
         image = image_files.read_rgb(capture / frame["file_path"])
@@ -116,13 +115,13 @@ def flat_photos(made: Generated) -> list[Photo]:
 
 
 def flattened(
-    image: UInt8[np.ndarray, "size size 3"] | Bool[np.ndarray, "size size"], lens: handheld.Lens
+    image: UInt8[np.ndarray, "size size 3"] | Bool[np.ndarray, "size size"], lens: dict[str, float]
 ) -> Float[np.ndarray, "size size *channels"]:
     """Returns an image without the distortion of its lens, centred."""
     size = len(image)
     ticks = np.arange(size) + 0.5 - 0.5 * size
-    towards = np.stack(np.meshgrid(ticks, ticks), axis=-1) / lens.focal
-    at = lens.focal * handheld.bent(lens, towards) + [lens.centre_x, lens.centre_y] - 0.5
+    towards = np.stack(np.meshgrid(ticks, ticks), axis=-1) / lens["focal"]
+    at = lens["focal"] * _bent(lens, towards) + [lens["centre_x"], lens["centre_y"]] - 0.5
     order = 1 if image.ndim == 2 else 3
     values = np.atleast_3d(image).astype(np.float64)
     channels = [
@@ -130,6 +129,16 @@ def flattened(
         for each in np.moveaxis(values, -1, 0)
     ]
     return np.stack(channels, axis=-1).reshape(*image.shape)
+
+
+def _bent(lens: dict[str, float], towards: np.ndarray) -> np.ndarray:
+    """Returns where a lens images directions of unit depth (OpenCV's model)."""
+    x, y = towards[..., 0], towards[..., 1]
+    squared, product = x * x + y * y, x * y
+    radial = 1.0 + lens["k1"] * squared + lens["k2"] * squared**2
+    across = x * radial + 2.0 * lens["p1"] * product + lens["p2"] * (squared + 2.0 * x * x)
+    down = y * radial + lens["p1"] * (squared + 2.0 * y * y) + 2.0 * lens["p2"] * product
+    return np.stack([across, down], axis=-1)
 
 
 def errors(

@@ -42,7 +42,7 @@ class Corners(NamedTuple):
     patches: Float[np.ndarray, "corners area"]
 
 
-class Picture(NamedTuple):
+class GreyImage(NamedTuple):
     """An image in grey, and coefficients of cubic splines through it and its slopes.
 
     Attributes:
@@ -58,24 +58,24 @@ class Picture(NamedTuple):
     down: Float[np.ndarray, "h w"]
 
 
-def prepare(image: UInt8[np.ndarray, "h w 3"]) -> Picture:
+def prepare(image: UInt8[np.ndarray, "h w 3"]) -> GreyImage:
     """Returns an 8-bit image in grey."""
     luma = image.astype(np.float64) @ [0.299, 0.587, 0.114] / 255.0
     grey = scipy.ndimage.gaussian_filter(luma, _BLUR, mode="nearest")
     down, right = np.gradient(grey)
     splines = (scipy.ndimage.spline_filter(each, mode="nearest") for each in (grey, right, down))
-    return Picture(grey, *splines)
+    return GreyImage(grey, *splines)
 
 
-def find_corners(picture: Picture, usable: Bool[np.ndarray, "h w"], *, most: int) -> Corners:
+def find_corners(image: GreyImage, usable: Bool[np.ndarray, "h w"], *, most: int) -> Corners:
     """Returns the strongest corners of an image.
 
     Args:
-      picture: the image.
+      image: the image.
       usable: pixels where corners may lie.
       most: largest number of corners.
     """
-    down, right = np.gradient(picture.grey)
+    down, right = np.gradient(image.grey)
     xx, xy, yy = (
         scipy.ndimage.gaussian_filter(product, _WINDOW, mode="nearest")
         for product in (right * right, right * down, down * down)
@@ -101,7 +101,7 @@ def find_corners(picture: Picture, usable: Bool[np.ndarray, "h w"], *, most: int
     shift = shift[..., 0]
     close = np.abs(shift).max(axis=1) < _FARTHEST
     places = np.stack([columns, rows], axis=-1)[close] + 0.5 + shift[close]
-    return Corners(places, normalised(sample(picture.spline, _around(places))))
+    return Corners(places, normalised(sample(image.spline, _around(places))))
 
 
 def normalised(patches: Float[np.ndarray, "n area"]) -> Float[np.ndarray, "n area"]:
@@ -120,8 +120,8 @@ def sample(
 
 
 def align_patches(
-    first: Picture,
-    second: Picture,
+    first: GreyImage,
+    second: GreyImage,
     places: Float[np.ndarray, "n 2"],
     starts: Float[np.ndarray, "n 2"],
 ) -> tuple[Float[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from experiments.cameras import bundle, corners
 from experiments.cameras.bundle import Prior, Sightings, Solution, Views
-from experiments.cameras.corners import Corners, Picture
+from experiments.cameras.corners import Corners, GreyImage
 
 # Views that each view is compared with; most corners of a view.
 _NEIGHBOURS, _MOST_CORNERS = 10, 500
@@ -87,11 +87,11 @@ def refine(
     Raises:
       ValueError: if most views show too few points beside the object.
     """
-    pictures = [corners.prepare(photo.image) for photo in photos]
+    greys = [corners.prepare(photo.image) for photo in photos]
     usable = [_usable(photo) for photo in photos]
     found = [
-        corners.find_corners(picture, allowed, most=_MOST_CORNERS)
-        for picture, allowed in zip(pictures, usable, strict=True)
+        corners.find_corners(image, allowed, most=_MOST_CORNERS)
+        for image, allowed in zip(greys, usable, strict=True)
     ]
     pairs = neighbours(views)
     shown = np.array([len(each.places) for each in found])
@@ -102,7 +102,7 @@ def refine(
     solution, seen = _solve(views, seen, prior, _LARGEST_ERRORS[0])
     tell(_describe("corners", solution, seen))
     for _ in range(2):
-        seen = _aligned(solution, seen, pictures, usable, pairs)
+        seen = _aligned(solution, seen, greys, usable, pairs)
         start = solution.views
         solution, seen = _solve(
             views, seen, prior, _LARGEST_ERRORS[1], start=start, points=solution.points
@@ -266,7 +266,7 @@ def _widest(
 def _aligned(
     solution: Solution,
     seen: Sightings,
-    pictures: Sequence[Picture],
+    greys: Sequence[GreyImage],
     usable: Sequence[np.ndarray],
     pairs: Int[np.ndarray, "pairs 2"],
 ) -> Sightings:
@@ -286,7 +286,7 @@ def _aligned(
         here, start = here[free], start[free]
         if not len(here):
             continue
-        where, alike = corners.align_patches(pictures[first], pictures[second], at[here], start)
+        where, alike = corners.align_patches(greys[first], greys[second], at[here], start)
         view.append(np.full(np.count_nonzero(alike), second))
         point.append(here[alike])
         places.append(where[alike])

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from benchmarks import cameras as benchmark
-from experiments.dataset import captures
+from experiments.dataset import captures, frame_files, handheld
 from refref_jax.data import image_files, scene_folder
 from refref_jax.data.nerfstudio import capture as nerfstudio
-from refref_jax.geometry.cameras import image_rays
+from refref_jax.geometry.cameras import box_filter, image_rays
 from tests.processes.command import ROOT, run_command
 
 _PYTHON = ROOT / ".venv-dataset" / "bin" / "python"
@@ -47,6 +47,21 @@ def test_truth_and_capture_differ_by_the_stated_errors():
     turned, moved = benchmark.errors(given[:, :3], true[:, :3])
     assert 0.2 < turned.mean() < 0.35 and 0.3 < moved.mean() < 0.6
     assert benchmark.errors(true[:, :3], true[:, :3])[0].max() < 1e-5
+
+
+def test_an_image_freed_of_its_lens_is_that_of_the_pinhole():
+    lens, focal = handheld.usual_lens(96, 80.0), 80.0
+    columns, rows = np.meshgrid(*[(np.arange(3 * 120) + 0.5) / 3 - 60.0] * 2)
+    light = 0.4 + 0.25 * np.stack([np.sin(columns / 9), np.cos(rows / 8), np.sin(rows / 7)], -1)
+    taken = handheld.photograph(light, lens, fine_focal=3 * focal, size=96, gain=np.ones(3), seed=0)
+    flat = benchmark.flattened(taken, lens._asdict())
+    pinhole = frame_files.to_srgb(box_filter(light[36:-36, 36:-36], 3))
+    inner = (slice(8, -8), slice(8, -8))
+    difference = flat[inner] - pinhole[inner]
+    # Noise, and no shift: a tenth of a pixel would be about 0.7 grey levels of slope.
+    assert abs(difference.mean()) < 0.1 and difference.std() < 3.0
+    moved = np.gradient(pinhole.astype(float), axis=1)[inner]
+    assert abs((difference * moved).sum() / (moved**2).sum()) < 0.02
 
 
 @pytest.fixture(scope="module")
