@@ -46,7 +46,7 @@ def _of_channel(value: float | list[float], channel: int) -> float:
 
 def _glass(part: dict[str, Any]) -> Any:
     """Returns an interface of glass, for the first colour channel."""
-    material, nodes, links = _new_material(part["mesh"])
+    material, nodes, links = new_material(part["mesh"])
     bsdf = nodes.new(_GLASS)
     bsdf.distribution = "GGX"  # a roughness of 0 makes it sharp
     bsdf.inputs["Roughness"].default_value = part.get("roughness", 0.0)
@@ -68,7 +68,7 @@ def _glass(part: dict[str, Any]) -> Any:
 
 def _metal(part: dict[str, Any]) -> Any:
     """Returns the surface of a conductor, relative to the medium outside."""
-    material, nodes, links = _new_material(part["mesh"])
+    material, nodes, links = new_material(part["mesh"])
     bsdf = nodes.new("ShaderNodeBsdfMetallic")
     bsdf.distribution, bsdf.fresnel_type = "GGX", "PHYSICAL_CONDUCTOR"
     bsdf.inputs["Roughness"].default_value = part.get("roughness", 0.0)
@@ -84,7 +84,7 @@ def _metal(part: dict[str, Any]) -> Any:
 
 def _diffuse(part: dict[str, Any]) -> Any:
     """Returns an opaque surface that is lit by the scene."""
-    material, nodes, links = _new_material(part["mesh"])
+    material, nodes, links = new_material(part["mesh"])
     bsdf = nodes.new("ShaderNodeBsdfDiffuse")
     bsdf.inputs["Color"].default_value = (*part["albedo"], 1.0)
     bsdf.inputs["Roughness"].default_value = 0.0  # Lambert
@@ -95,7 +95,7 @@ def _diffuse(part: dict[str, Any]) -> Any:
 
 def _emitter(part: dict[str, Any]) -> Any:
     """Returns an opaque surface that emits the same light to all directions, on both sides."""
-    material, nodes, _ = _new_material(part["mesh"])
+    material, nodes, _ = new_material(part["mesh"])
     if part["radiance"] == "vertex_colours":
         colour = nodes.new("ShaderNodeAttribute")
         colour.attribute_name = COLOURS
@@ -107,20 +107,20 @@ def _emitter(part: dict[str, Any]) -> Any:
     return material
 
 
-def wall(image: Path) -> Any:
+def wall(image: Path, *, extension: str = "REPEAT") -> Any:
     """Returns an emissive wall with an image mapped by the mesh's UVs."""
-    material, nodes, _ = _new_material(image.name)
+    material, nodes, _ = new_material(image.name)
     texture = nodes.new("ShaderNodeTexImage")
     texture.image = _load(image)
     texture.interpolation = "Linear"
-    texture.extension = "REPEAT"
+    texture.extension = extension
     _glow(material, texture)
     return material
 
 
 def sphere(image: Path) -> Any:
     """Returns an emissive sphere around the origin, with an image mapped by direction."""
-    material, nodes, links = _new_material(image.name)
+    material, nodes, links = new_material(image.name)
     geometry = nodes.new("ShaderNodeNewGeometry")
     normalise = nodes.new("ShaderNodeVectorMath")
     normalise.operation = "NORMALIZE"
@@ -149,7 +149,7 @@ def world(image: Path | None) -> Any:
     return made
 
 
-def _new_material(name: str) -> tuple[Any, Any, Any]:
+def new_material(name: str) -> tuple[Any, Any, Any]:
     """Returns a material without nodes, its nodes and its links."""
     material = bpy.data.materials.new(name)
     material.use_nodes = True

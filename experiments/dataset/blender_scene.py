@@ -225,6 +225,31 @@ def _add_cube(folder: Path, record: dict[str, Any]) -> None:
         layer.data.foreach_set("uv", uv.astype(np.float32).ravel())
 
 
+def _add_surfaces(folder: Path, record: dict[str, Any]) -> None:
+    """Adds rectangles that emit the light of their images, as `room.Surface` describes them."""
+    _set_world(None)
+    for surface in record["surfaces"]:
+        material = blender_materials.wall(folder / surface["image"], extension="EXTEND")
+        add_rectangle(surface, material)
+
+
+def add_rectangle(surface: dict[str, Any], material: Any) -> Any:
+    """Adds a rectangle with the corner and the sides of a record, and returns it."""
+    corner, along, up = (np.array(surface[key]) for key in ("corner", "along", "up"))
+    uv = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    vertices = corner + uv[:, :1] * along + uv[:, 1:] * up
+    faces = np.array([[0, 1, 2, 3]])
+    plane = _add_mesh(surface["name"], vertices, faces, material, smooth=False)
+    layer = plane.data.uv_layers.new(name="uv")
+    layer.data.foreach_set("uv", uv.astype(np.float32).ravel())
+    return plane
+
+
+def _add_nothing(folder: Path, record: dict[str, Any]) -> None:
+    del folder, record
+    _set_world(None)
+
+
 def _add_sphere(folder: Path, record: dict[str, Any]) -> None:
     _set_world(None)
     bpy.ops.mesh.primitive_ico_sphere_add(subdivisions=_SUBDIVISIONS, radius=1.0)
@@ -251,7 +276,13 @@ def _set_world(image: Path | None) -> None:
     bpy.context.scene.world = blender_materials.world(image)
 
 
-_BACKGROUNDS = {"cube": _add_cube, "sphere": _add_sphere, "env": _add_environment}
+_BACKGROUNDS = {
+    "cube": _add_cube,
+    "sphere": _add_sphere,
+    "env": _add_environment,
+    "surfaces": _add_surfaces,
+    "none": _add_nothing,
+}
 
 
 def place_camera(pose: list[list[float]], angle_x: float) -> None:

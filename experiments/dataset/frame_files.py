@@ -93,15 +93,15 @@ def is_done(scene: Path, split: Split, number: int, *, linear: bool) -> bool:
 def write(scene: Path, split: Split, number: int, rendering: Rendering, *, linear: bool) -> None:
     """Writes the files of a view; for the arguments see `is_done`."""
     named = relative(split, number)
-    _write(scene / named.image, _png(to_srgb(rendering.linear)))
-    _write(scene / named.mask, _png(np.where(rendering.mask, 255, 0).astype(np.uint8)))
-    _write(scene / named.depth_8_bit, _png(to_published_depth(rendering.depth)))
-    _write(scene / named.depth, _exr("Z", rendering.depth))
-    _write(scene / named.normal, _exr("RGB", rendering.normal))
+    write_file(scene / named.image, _png(to_srgb(rendering.linear)))
+    write_file(scene / named.mask, _png(np.where(rendering.mask, 255, 0).astype(np.uint8)))
+    write_file(scene / named.depth_8_bit, _png(to_published_depth(rendering.depth)))
+    write_file(scene / named.depth, _exr("Z", rendering.depth))
+    write_file(scene / named.normal, _exr("RGB", rendering.normal))
     if linear:
         # Half precision ends at 65504.
         half = np.minimum(rendering.linear, np.finfo(np.float16).max).astype(np.float16)
-        _write(scene / named.linear, _exr("RGB", half))
+        write_file(scene / named.linear, _exr("RGB", half))
 
 
 def remove_unfinished(scene: Path) -> None:
@@ -179,7 +179,7 @@ def _exr(name: str, pixels: np.ndarray) -> Callable[[Path], None]:
     return write_to
 
 
-def _write(path: Path, write_to: Callable[[Path], None]) -> None:
+def write_file(path: Path, write_to: Callable[[Path], None]) -> None:
     """Writes a file atomically, also on a power failure."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_files.written_file(path, survives="machine") as draft:

@@ -47,7 +47,7 @@ def produce(
     for scene in chosen:
         scene_setup.check(out / str(scene), scene, settings)
     out.mkdir(parents=True, exist_ok=True)
-    with _alone_in(out) as scratch:
+    with alone_in(out) as scratch:
         for scene in chosen:
             frame_files.remove_unfinished(out / str(scene))
         wanted = views.all_views(chosen, settings)
@@ -55,24 +55,31 @@ def produce(
         if not missing:
             print(f"Nothing to do: all {len(wanted)} views exist.")
             return True
-        cores = _cores()
+        available = cores()
         # A GPU renders one view at a time.
-        usual = cores if settings.device == "CPU" else 1
+        usual = available if settings.device == "CPU" else 1
         count = min(workers or usual, len(missing))
         pool = Pool(
             views.tasks(out, missing, settings, objects=objects, scratch=scratch),
             blender=blender,
             scratch=scratch,
             workers=count,
-            threads=max(1, cores // count),
+            threads=max(1, available // count),
             device=settings.device,
         )
-        done = _render(pool, len(wanted) - len(missing), len(wanted), stopped)
+        done = render(pool, len(wanted) - len(missing), len(wanted), stopped)
         return done == len(missing)
 
 
-def _render(pool: Pool, there: int, total: int, stopped: Callable[[], bool]) -> int:
-    """Renders views, and returns their number."""
+def render(pool: Pool, there: int, total: int, stopped: Callable[[], bool]) -> int:
+    """Renders the views of a pool, and returns their number.
+
+    Args:
+      pool: the pool.
+      there: number of views that exist already.
+      total: number of all views.
+      stopped: callback that returns whether the user wants to end; queried after every view.
+    """
     started, done = time.monotonic(), 0
     with ProgressBar("render", total, there) as bar, pool:
         for done, task in enumerate(pool.run(), start=1):
@@ -84,7 +91,7 @@ def _render(pool: Pool, there: int, total: int, stopped: Callable[[], bool]) -> 
 
 
 @contextlib.contextmanager
-def _alone_in(out: Path) -> Iterator[Path]:
+def alone_in(out: Path) -> Iterator[Path]:
     """Locks `out` for this command, and yields an empty folder for temporary files.
 
     After an error the folder remains, for the logs in it.
@@ -98,7 +105,7 @@ def _alone_in(out: Path) -> Iterator[Path]:
         shutil.rmtree(scratch, ignore_errors=True)
 
 
-def _cores() -> int:
+def cores() -> int:
     """Returns the number of cores available to this process."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))

@@ -1,0 +1,1 @@
+"""Refinement of cameras on pixels beside the object."""
