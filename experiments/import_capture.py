@@ -182,13 +182,14 @@ def _read(source: Path) -> tuple[Capture, tuple[str, ...], bool]:
         capture = nerfstudio.read_capture(source)
     else:
         capture = colmap.read_capture(model, _image_folder(source, model))
-    lacking: tuple[str, ...] = ()
-    if _MASK_FOLDER.value is not None and _MASKS.value != "none":
+    if _MASKS.value == "none":
+        return capture, (), model is not None
+    if _MASK_FOLDER.value is not None:
         folder = Path(_MASK_FOLDER.value)
         if not folder.is_dir():
             raise SceneError(f"{folder} is not a folder. Give the folder of the masks.")
-        capture, lacking = captures.with_masks(capture, folder)
-    return capture, lacking, model is not None
+        capture = captures.with_masks(capture, folder)
+    return *captures.masked_frames(capture), model is not None
 
 
 def _image_folder(source: Path, model: Path) -> Path:
@@ -351,7 +352,10 @@ def _tell_masks(
     seen_by: np.ndarray | None,
 ) -> None:
     if lacking:
-        print(f"warning: {len(lacking)} photographs have no mask, such as {lacking[0]}.")
+        print(
+            f"Left out: {len(lacking)} photographs without a mask, such as {lacking[0]}. Give each "
+            "one a mask to keep it, black where the object is not in view."
+        )
     for split, done in written.items():
         if done.empty:
             print(

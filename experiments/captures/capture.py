@@ -93,15 +93,44 @@ def every_nth(frames: int, *, every: int) -> dict[str, tuple[int, ...]]:
     return {"train": train, "test": tuple(range(0, frames, every))}
 
 
-def with_masks(capture: Capture, folder: Path) -> tuple[Capture, tuple[str, ...]]:
-    """Returns a capture with the masks of a folder, and the names of the frames without any.
+def masked_frames(capture: Capture) -> tuple[Capture, tuple[str, ...]]:
+    """Returns a capture of the frames that have a mask, and the names of the others.
+
+    Where the object is in an image without a mask is unknown, so that neither its background nor
+    its object can be learned from it. A capture without any mask stays as it is.
+
+    Raises:
+      SceneError: if other frames have a mask, but none of the listed training frames.
+    """
+    kept = [number for number, frame in enumerate(capture.frames) if frame.mask is not None]
+    if not kept or len(kept) == len(capture.frames):
+        return capture, ()
+    lacking = tuple(frame.name for frame in capture.frames if frame.mask is None)
+    places, splits = {number: place for place, number in enumerate(kept)}, capture.splits
+    if splits is not None:
+        splits = {
+            split: tuple(places[number] for number in numbers if number in places)
+            for split, numbers in splits.items()
+        }
+        splits = {split: numbers for split, numbers in splits.items() if numbers}
+        if "train" not in splits:
+            raise SceneError(
+                f"No training image has a mask, but others have, not {lacking[0]}. Add masks, or "
+                "drop them: --masks=none."
+            )
+    frames = tuple(capture.frames[number] for number in kept)
+    return capture._replace(frames=frames, splits=splits), lacking
+
+
+def with_masks(capture: Capture, folder: Path) -> Capture:
+    """Returns a capture with the masks of a folder; some frames may have none.
 
     The mask of `photo.jpg` is `photo.jpg.png`, as in COLMAP, or `photo.png`, in the same subfolder.
 
     Raises:
       SceneError: if no frame has one, or one has another size than its image.
     """
-    found, lacking = [], []
+    found = []
     for frame in capture.frames:
         name = Path(frame.name)
         # nerfstudio's names begin with the folder of the images.
@@ -109,16 +138,14 @@ def with_masks(capture: Capture, folder: Path) -> tuple[Capture, tuple[str, ...]
         files = [each.with_name(each.name + ".png") for each in tries]
         files += [each.with_suffix(".png") for each in tries]
         mask = next((file for file in files if file.is_file()), None)
-        if mask is None:
-            lacking.append(frame.name)
         found.append(frame._replace(mask=mask))
-    if len(lacking) == len(found):
+    if all(frame.mask is None for frame in found):
         raise SceneError(
-            f"{folder} has no mask of {lacking[0]}, nor of any other image. Name the masks like "
+            f"{folder} has no mask of {found[0].name}, nor of any other image. Name the masks like "
             "the images, with the ending .png."
         )
     check_sizes(found)
-    return capture._replace(frames=tuple(found)), tuple(lacking)
+    return capture._replace(frames=tuple(found))
 
 
 def check_sizes(frames: Sequence[CaptureFrame]) -> None:

@@ -185,7 +185,7 @@ def read_capture(source: Path) -> Capture:
 
     Raises:
       SceneError: if a file is missing or broken, if a pose is not a rigid motion, if the model of a
-        camera is not known, or if some frames have a mask and others have none.
+        camera is not known.
     """
     path = source if source.suffix == ".json" else source / FILE
     if not path.is_file():
@@ -203,7 +203,6 @@ def read_capture(source: Path) -> Capture:
     frames = sorted(
         (read_frame(content, record, path) for record in records), key=lambda frame: frame.name
     )
-    _check_masks(frames, path)
     check_sizes(frames)
     scale = read_number([content], "applied_scale", path)
     if scale is not None and not scale > 0.0:
@@ -275,15 +274,6 @@ def _describe_lens(cameras: Cameras) -> dict[str, float]:
         "h": cameras.height,
         **dict.fromkeys(DISTORTION, 0.0),
     }
-
-
-def _check_masks(frames: Sequence[CaptureFrame], path: Path) -> None:
-    lacking = [frame.name for frame in frames if frame.mask is None]
-    if 0 < len(lacking) < len(frames):
-        raise SceneError(
-            f"{lacking[0]} in {path} has no mask_path, like {len(lacking)} of {len(frames)} "
-            "frames. Add it to these, or remove it from all."
-        )
 
 
 def _applied_transform(content: dict[str, Any], path: Path) -> Float[np.ndarray, "3 4"]:

@@ -4,6 +4,7 @@ import math
 import numpy as np
 import pytest
 
+from experiments.captures import capture as captures
 from experiments.captures import nerfstudio
 from refref_jax.data import SceneError
 from refref_jax.geometry.cameras import Cameras
@@ -90,7 +91,6 @@ def _distorted(key, value, frame=None):
         (_distorted("val_filenames", ["images/frame_00001.png"]), "lists no train_filenames"),
         (_distorted("applied_transform", [[2, 0, 0, 0]]), "applied_transform .* 4 x 4 matrix"),
         (_distorted("applied_scale", -1.0), "applied_scale is -1"),
-        (lambda content: content["frames"][2].pop("mask_path"), "frame_00002.* no mask_path, like"),
         (lambda content: content.pop("fl_x") + content.pop("fl_y"), "lacks the focal length"),
     ],
 )
@@ -120,6 +120,32 @@ def _listed(train, val, test):
             content[f"{split}_filenames"] = [f"./images/frame_{i:05d}.png" for i in numbers]
 
     return change
+
+
+def test_frames_without_a_mask_are_left_out(capture):
+    whole = nerfstudio.read_capture(edit(capture, _listed([5, 1, 2], [3], [4, 7])))
+    assert captures.masked_frames(whole) == (whole, ())
+
+    def change(content):
+        for number in (2, 3):
+            content["frames"][number].pop("mask_path")
+
+    kept, lacking = captures.masked_frames(nerfstudio.read_capture(edit(capture, change)))
+    assert lacking == ("images/frame_00002.png", "images/frame_00003.png")
+    assert kept.splits == {"train": (1, 3), "test": (2, 5)}  # numbers of the frames that are left
+    names = [kept.frames[number].name for number in kept.splits["train"] + kept.splits["test"]]
+    assert names == [f"images/frame_0000{number}.png" for number in (1, 5, 4, 7)]
+
+
+def test_masks_of_test_frames_alone_are_refused(capture):
+    def change(content):
+        _listed([0, 1], [], [2])(content)
+        for number in (0, 1):
+            content["frames"][number].pop("mask_path")
+
+    read = nerfstudio.read_capture(edit(capture, change))
+    with pytest.raises(SceneError, match=r"training image has a mask.*frame_00000.*--masks=none"):
+        captures.masked_frames(read)
 
 
 def test_lists_of_files_are_the_splits(capture):
