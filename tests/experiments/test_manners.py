@@ -172,6 +172,10 @@ _MISTAKES = {
         "x --cut=2": "Give 0.02 for 2 %",
         "nowhere": "nowhere is not a folder.",
     },
+    "capture_to_model": {
+        "--source=nowhere --out=OUT": "nowhere is not a folder.",
+        "--source=x --out=OUT --steps=0": "--steps",
+    },
     "import_capture": {
         "--source=x --out=OUT --scale=-1": "Give a positive number",
         "--source=x --out=OUT --centre=1,2": "Give x,y,z",
