@@ -22,10 +22,10 @@ from experiments.cli import app
 from experiments.cli import flags as cli_flags
 from experiments.cli import scenes as cli_scenes
 from experiments.cli.progress import ProgressBar
-from refref_jax.data import SceneError
+from refref_jax.data import FARTHEST, SceneError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
     from experiments.captures.capture import Capture
     from experiments.captures.scenes import Layout, Written
@@ -130,6 +130,7 @@ def _make_scene(source: Path, out: Path) -> None:
     where = _placement(ball, poses, is_colmap)
     content = _content(capture, source, where, given)
     placed = {split: world.place(each, where) for split, each in split_poses.items()}
+    _check_placed(placed.values())
     total = sum(len(each) for each in splits.values())
     with ProgressBar("import", total) as bar:
         steps = iter(range(1, total + 1))
@@ -149,9 +150,24 @@ def _make_scene(source: Path, out: Path) -> None:
         if mesh_files.material_of(Path(name)) is None:
             print(f"warning: {name} ends on no material. Rename it, or give it an index by --ior.")
     print(f"Scene:   {out}")
-    masked = written["train"].masked is not None
+    masked = bool(written["train"].masked)
     run = ("reconstruct" if masked and not given else "train", f"--scene={out}")
     print(f"Next: {app.shell(*run, f'--out={out}_run')}")
+
+
+def _check_placed(poses: Iterable[np.ndarray]) -> None:
+    """Rejects a placement that leaves the cameras at one place, or too far away for a scene."""
+    positions = np.concatenate([each[:, :, 3] for each in poses])
+    furthest = float(np.max(np.abs(positions)))
+    if not furthest <= FARTHEST:
+        raise SceneError(
+            f"--centre and --scale put a camera {furthest:.3g} units from the origin, beyond "
+            f"{FARTHEST:g}. Give others."
+        )
+    if len(positions) > 1 and not np.ptp(positions, axis=0).max() > 1.0 / FARTHEST:
+        raise SceneError(
+            "All cameras are at one place, or --centre and --scale put them there. Give others."
+        )
 
 
 def _content(
@@ -364,6 +380,12 @@ def _tell_masks(
             )
     names = [frame.name for frame in layout.frames]
     seen = np.zeros(len(names), bool) if seen_by is None else seen_by
+    masked = len(names) - len(written["train"].empty)
+    if seen_by is not None and masked < world.FEW_VIEWS:
+        print(
+            f"warning: {masked} masks hardly determine where the object is: compare its radius "
+            "with what you know, or give --centre and --scale."
+        )
     doubtful = [name for name in np.array(names)[seen] if name in written["train"].empty]
     if doubtful:
         print(

@@ -85,7 +85,7 @@ def refine(
       tell: function that receives progress in words.
 
     Raises:
-      ValueError: if most views show too few points beside the object.
+      ValueError: if most views show too few points beside the object, or all are at one place.
     """
     greys = [corners.prepare(photo.image) for photo in photos]
     usable = [_usable(photo) for photo in photos]
@@ -99,6 +99,8 @@ def refine(
     if np.median(shown) < _FEWEST or not len(pairs):
         _judge(np.zeros_like(shown), tell)
     seen = _tracks(views, found, pairs, prior)
+    if not len(seen.view):
+        _judge(np.zeros_like(shown), tell)
     solution, seen = _solve(views, seen, prior, _LARGEST_ERRORS[0])
     tell(_describe("corners", solution, seen))
     for _ in range(2):
@@ -110,8 +112,10 @@ def refine(
         tell(_describe("patches", solution, seen))
     shown = np.bincount(seen.view, minlength=len(views.poses))
     _judge(shown, tell)
-    change = bundle.similarity(solution.views.poses, views.poses)
-    poses = bundle.moved(solution.views.poses, change)
+    known = shown >= _FEWEST
+    change = bundle.similarity(solution.views.poses[known], views.poses[known])
+    # A pose that few points determine is more likely wrong than the given one.
+    poses = np.where(known[:, None, None], bundle.moved(solution.views.poses, change), views.poses)
     points = change.scale * solution.points @ change.rotation.T + change.shift
     return Refined(
         poses,
@@ -135,7 +139,7 @@ def _judge(shown: Int[np.ndarray, " views"], tell: Callable[[str], None]) -> Non
         names = ", ".join(map(str, few[:8]))
         tell(
             f"warning: {len(few)} views show fewer than {_FEWEST} points beside the object (views "
-            f"{names}), and nearly keep their poses."
+            f"{names}, from 0, split after split), and keep their poses."
         )
 
 
@@ -143,6 +147,10 @@ def neighbours(views: Views) -> Int[np.ndarray, "pairs 2"]:
     """Returns the pairs of views that are close in place and direction, the lower number first."""
     places, axes = views.poses[..., 3], views.poses[..., 2]
     spread = np.linalg.norm(places - places.mean(axis=0), axis=-1).mean()
+    if not spread > 1e-9 * (1.0 + np.abs(places).max()):
+        raise ValueError(
+            "All cameras are at one place, from where no depth is seen. Check the poses."
+        )
     apart = np.linalg.norm(places[:, None] - places, axis=-1) / spread
     angle = np.arccos(np.clip(axes @ axes.T, -1.0, 1.0))
     far = apart + angle
@@ -183,14 +191,15 @@ def _tracks(
     places = np.concatenate([each.places for each in found])
     # A point that a view shows twice is none.
     keys = point * len(found) + view
-    twice = np.bincount(keys, minlength=keys.max() + 1)[keys] > 1
+    twice = np.bincount(keys, minlength=keys.max(initial=0) + 1)[keys] > 1
     spoilt = np.isin(point, point[twice])
     return _renumbered(Sightings(view, point, places), ~spoilt)
 
 
 def _renumbered(seen: Sightings, kept: np.ndarray) -> Sightings:
     """Returns the kept sightings of points that at least two views show, points from 0."""
-    kept = kept & (np.bincount(seen.point[kept], minlength=seen.point.max() + 1)[seen.point] > 1)
+    total = seen.point.max(initial=-1) + 1
+    kept = kept & (np.bincount(seen.point[kept], minlength=total)[seen.point] > 1)
     _, point = np.unique(seen.point[kept], return_inverse=True)
     return Sightings(seen.view[kept], point, seen.places[kept])
 
@@ -239,6 +248,8 @@ def _solve(
         error = np.linalg.norm(images - seen.places, axis=-1)
         good = (error < limit) & (depths > 0.0)
         good &= (_widest(begin, points, seen, good) > np.radians(_LEAST_ANGLE))[seen.point]
+        if not good.any():
+            _judge(np.zeros(len(views.poses), np.int64), lambda _: None)
         counted = np.bincount(seen.point[good], minlength=len(points))
         points = points[counted > 1]
         seen = _renumbered(seen, good)

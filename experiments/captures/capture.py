@@ -133,8 +133,9 @@ def with_masks(capture: Capture, folder: Path) -> Capture:
     found = []
     for frame in capture.frames:
         name = Path(frame.name)
-        # nerfstudio's names begin with the folder of the images.
-        tries = [folder / part for part in (name, Path(*name.parts[1:])) if part.parts]
+        # nerfstudio's names begin with the folder of the images: images, images_2, ...
+        inner = name.parts[0].startswith("images") and len(name.parts) > 1
+        tries = [folder / name, *([folder / Path(*name.parts[1:])] if inner else [])]
         files = [each.with_name(each.name + ".png") for each in tries]
         files += [each.with_suffix(".png") for each in tries]
         mask = next((file for file in files if file.is_file()), None)
@@ -195,6 +196,8 @@ def read_points(path: Path) -> PointCloud:
             f"{path} cannot be read as a PLY of points ({error}). Copy it again, or remove "
             "ply_file_path."
         ) from error
+    if not np.all(np.isfinite(positions)):
+        raise SceneError(f"{path} has a point that is not finite. Remove it, or ply_file_path.")
     if colours.shape[:1] != positions.shape[:1]:
         colours = np.full((len(positions), 3), 128, np.uint8)
     return PointCloud(positions, colours[:, :3])

@@ -16,6 +16,7 @@ Source: https://docs.nerf.studio/quickstart/data_conventions.html. `camera_angle
 without an extension are Instant NGP's, whose files have the same form.
 """
 
+import collections
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -203,6 +204,9 @@ def read_capture(source: Path) -> Capture:
     frames = sorted(
         (read_frame(content, record, path) for record in records), key=lambda frame: frame.name
     )
+    counted = collections.Counter(Path(frame.name) for frame in frames)
+    if repeated := [name for name, count in counted.items() if count > 1]:
+        raise SceneError(f"{path} lists {repeated[0]} twice. Remove one of the frames.")
     check_sizes(frames)
     scale = read_number([content], "applied_scale", path)
     if scale is not None and not scale > 0.0:
@@ -291,6 +295,8 @@ def _splits(
     found: dict[str, tuple[int, ...]] = {}
     for split in ("train", "test", "val"):
         listed = content.get(f"{split}_filenames") or []
+        if not isinstance(listed, list):
+            raise SceneError(f"{split}_filenames is {listed!r} in {path}. Give a list of names.")
         for name in listed:
             if not isinstance(name, str) or Path(name) not in numbers:
                 raise SceneError(

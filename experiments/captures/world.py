@@ -33,6 +33,14 @@ _CELLS, _ROUNDS, _VIEWS = 40, 6, 100
 # so that none is outside of the cube that R3F searches.
 _BULK, _LEAST_REACH = 0.95, 0.75
 
+# Share of the pixels that masks of an object may mark; largest radius of its ball as a share of the
+# distance of the nearest camera; least angle between optical axes, degrees. Seen from nearly one
+# direction, the cones of all masks also meet in front of the cameras.
+_MOST_MARKED, _LARGEST, _NARROWEST = 0.9, 0.6, 40.0
+
+FEW_VIEWS = 10
+"""Number of masks below which the ball around the object is a guess."""
+
 # Share of the views of a point that must show it within their masks, and that must see it at all.
 _AGREE, _SEE = 0.97, 0.5
 
@@ -154,12 +162,26 @@ def ball_of_masks(masks: Bool[np.ndarray, "views h w"], cameras: Cameras) -> Bal
       cameras: their cameras.
 
     Raises:
-      SceneError: if no mask marks the object, or their cones have nothing in common.
+      SceneError: if no mask marks the object, their cones have nothing in common, or they leave its
+        place unknown: masks that mark nearly everything, views from nearly one
+        direction, or a ball that nearly holds a camera.
     """
     shown = np.flatnonzero(masks.any(axis=(1, 2)))
     if not len(shown):
         raise SceneError("No mask marks the object. Give the centre of the scene, or other masks.")
+    if (share := float(masks[shown].mean())) > _MOST_MARKED:
+        raise SceneError(
+            f"The masks mark {100 * share:.0f} % of the pixels, too many for an object. Check that "
+            "they are masks and what white means (--masks), or give --centre and --scale."
+        )
     shown = shown[np.unique(np.linspace(0, len(shown) - 1, _VIEWS).astype(int))]
+    axes = cameras.poses[shown, :, 2]
+    widest = float(np.degrees(np.arccos(np.clip(np.min(axes @ axes.T), -1.0, 1.0))))
+    if widest < _NARROWEST:
+        raise SceneError(
+            f"The {len(shown)} masks leave the object's place unknown, as all views look within "
+            f"{widest:.0f} degrees of each other. Add views, or give --centre and --scale."
+        )
     outside = [distance_transform_edt(~mask) for mask in masks[shown]]
     poses = cameras.poses[shown]
     ball = ball_of_points(poses[..., 3])
@@ -177,7 +199,15 @@ def ball_of_masks(masks: Bool[np.ndarray, "views h w"], cameras: Cameras) -> Bal
         low, high = kept.min(axis=0) - size, kept.max(axis=0) + size
     centre = kept.mean(axis=0)
     away = np.linalg.norm(kept - centre, axis=-1)
-    return Ball(centre, float(max(np.quantile(away, _BULK), _LEAST_REACH * away.max())))
+    radius = float(max(np.quantile(away, _BULK), _LEAST_REACH * away.max()))
+    nearest = float(np.linalg.norm(poses[..., 3] - centre, axis=-1).min())
+    if radius > _LARGEST * nearest:
+        raise SceneError(
+            f"The {len(shown)} masks leave the object's place unknown: it would have a radius of "
+            f"{radius:.3g}, and a camera is {nearest:.3g} from its centre. Add views, or give "
+            "--centre and --scale."
+        )
+    return Ball(centre, radius)
 
 
 def sees(ball: Ball, cameras: Cameras) -> Bool[np.ndarray, " cameras"]:

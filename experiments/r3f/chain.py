@@ -53,6 +53,8 @@ def reconstruct(
     import_skimage()
     if config.geometry != field_surface.NAME or field_surface.has_masks(scene):
         _check_masks(scene, config)
+    if config.geometry == field_surface.NAME:
+        field_surface.check(scene, config)
     asked = Reconstruction(scene_names.of_folder(scene), fingerprint(scene), config)
     found = records.begin(out, asked)
     with atomic_files.hold(out):

@@ -31,7 +31,7 @@ from refref_jax.reconstruct.grids import Box, Grid, find_isosurface, sample
 from refref_jax.render import Model
 from refref_jax.render.images import find_first_surface
 from refref_jax.training.config import TrainConfig
-from refref_jax.training.resolve import read_facts, resolve
+from refref_jax.training.resolve import Resolved, read_facts, resolve
 
 NAME = "neus"
 """Name of this geometry."""
@@ -55,6 +55,21 @@ _MARGIN = 2.0
 def has_masks(scene: Path) -> bool:
     """Returns whether the training views of a scene have masks."""
     return scene_folder.read_frames(scene, "train").masks is not None
+
+
+def check(scene: Path, config: ReconstructionConfig) -> None:
+    """Rejects a scene on which the field cannot be trained.
+
+    Raises:
+      ValueError: if it is one, as where the background is unbounded.
+    """
+    try:
+        _resolved(scene, config)
+    except ValueError as error:
+        raise ValueError(
+            f"--geometry={NAME} cannot be used here, since its field cannot be trained: {error} "
+            "Use --geometry=hull, with masks."
+        ) from error
 
 
 def masked_scene(scene: Path, out: Path, config: ReconstructionConfig) -> Path:
@@ -113,6 +128,11 @@ def find(scene: Path, out: Path, config: ReconstructionConfig) -> Grid:
       ValueError: if the field has no surface, or cannot be trained on the scene.
       KeyboardInterrupt: if its training was stopped; it has been saved.
     """
+    model = index_stage.learned(scene, out / RUN, _resolved(scene, config))
+    return _largest(_around_object(model, config.resolution))
+
+
+def _resolved(scene: Path, config: ReconstructionConfig) -> Resolved:
     asked = TrainConfig().override(
         scene=str(scene.resolve()),
         paths="straight",
@@ -123,9 +143,7 @@ def find(scene: Path, out: Path, config: ReconstructionConfig) -> Grid:
         centre=config.centre,
         seed=config.seed,
     )
-    resolved = resolve(asked, read_facts(asked.scene, parts=()))
-    model = index_stage.learned(scene, out / RUN, resolved)
-    return _largest(_around_object(model, config.resolution))
+    return resolve(asked, read_facts(asked.scene, parts=()))
 
 
 def _around_object(model: Model, resolution: int) -> Grid:

@@ -33,7 +33,7 @@ _SINGULAR = 1e8
 _SHIFTED, _GROWN, _MOVED = 0.05, 0.1, 0.1
 _CERTAIN = 5.0
 
-# Share of the larger of growth and shift inside the outline below which the other one is left out.
+# Share of the larger of growth and shift below which the other one is left out.
 _LESSER = 0.25
 
 # Least residual along the outline that leads to a warning, sRGB, and its ratio to that inside.
@@ -87,9 +87,10 @@ def of_view(
     Args:
       rendered: sRGB image in `[0, 1]`.
       target: photograph, likewise.
-      mask: mask of the object; without one, all pixels are beside it.
+      mask: mask of the object; without one, nobody knows where light is straight.
     """
-    mask = np.zeros(target.shape[:2], bool) if mask is None else mask
+    if mask is None:
+        return Residuals(None, None, None, None)
     square = np.ones((2 * _APART + 1, 2 * _APART + 1), bool)
     inner, outer = binary_erosion(mask, square), ~binary_dilation(mask, square)
     near = ~inner & ~outer
@@ -122,7 +123,9 @@ def motion(
     row, column = np.nonzero(among)
     offsets = np.stack([column - column.mean(), row - row.mean()], axis=-1)[:, None]
     growing = np.sum(slopes * offsets, axis=-1, keepdims=True)
-    design = np.concatenate([slopes, growing], axis=-1).reshape(-1, 3)
+    # Exposure and white balance are no displacement.
+    gains = ours[among][:, :, None] * np.eye(3)
+    design = np.concatenate([slopes, growing, gains], axis=-1).reshape(-1, 6)
     # The photograph has at a pixel what the rendering has at the pixel less the displacement.
     wanted = (ours - theirs)[among].reshape(-1)
     normal = design.T @ design
@@ -144,7 +147,8 @@ def warnings(views: Sequence[Residuals]) -> tuple[str, ...]:
     """Returns what residuals look like, a sentence each; nothing if they look like noise.
 
     Cameras are wrong each in its own way, so that lengths of shifts count; everything else is the
-    same in all views. Of an object before wrong cameras or a wrong background nothing is said.
+    same in all views. Wrong cameras and backgrounds also shift what is inside the outline, so that
+    no warning of the object joins theirs.
 
     Args:
       views: residuals of several views.
@@ -153,12 +157,12 @@ def warnings(views: Sequence[Residuals]) -> tuple[str, ...]:
     inside = [view.inside for view in views if view.inside is not None]
     found = []
     shift, grown = _typical(beside, _shift), _typical(beside, _growth)
-    if shift > _SHIFTED:
+    if shift > max(_SHIFTED, _LESSER * abs(grown)):
         found.append(
             f"beside the object, images are shifted by {shift:.2f} pixels: cameras are a little "
             "off. Refine them, or do not trust differences of less than a decibel."
         )
-    if abs(grown) > _GROWN:
+    if abs(grown) > max(_GROWN, _LESSER * shift):
         found.append(
             f"beside the object, images are {'larger' if grown > 0.0 else 'smaller'} than they are "
             f"rendered, by {abs(grown):.2f} pixels: check size and centre of the background, and "

@@ -142,7 +142,8 @@ def second_ray(
     """Returns the offset from a point of a ray to that of the second ray; see `FieldKind.deform`.
 
     All points of a ray have the same second ray, and keep their distances along it. (In an
-    unbounded scene that holds within the scene radius, where space is not contracted.)
+    unbounded scene that holds within the scene radius, where space is not contracted.) Positions
+    are offset in half edges of the unit cube: a scene radius, or two in an unbounded scene.
 
     Args:
       params: parameters, from `init_radiance`.
@@ -161,7 +162,7 @@ def second_ray(
 
 
 class _SecondRay(nn.Module):
-    """Offsets of a ray's point that is nearest to the middle, in scene radii, and direction."""
+    """Offsets of a ray's point nearest to the middle, in half edges, and of its direction."""
 
     config: RosenerfConfig
 

@@ -171,7 +171,8 @@ def move(
         params, field, cells, points.direction, progress
     )
     radii = 4.0 if domain.space == "unbounded" else 2.0  # per edge of the cube
-    moved = jnp.clip(gaussians.positions + offsets.position[:, None] / radii, 0.0, 1.0)
+    per_edge = 2.0 if registry.has_second_ray(field) else radii
+    moved = jnp.clip(gaussians.positions + offsets.position[:, None] / per_edge, 0.0, 1.0)
     turned = numerics.normalize(points.direction + offsets.direction)
     steps = radii * numerics.length(jnp.diff(cells, axis=0))
     places = jnp.concatenate([jnp.zeros_like(steps[:1]), jnp.cumsum(steps)])

@@ -291,13 +291,21 @@ def test_masks_of_a_folder_may_be_incomplete(folder, tmp_path):
     (folder / "masks" / "frame_00005.png").unlink()
     (folder / "masks" / "frame_00004.png").rename(folder / "masks" / "frame_00004.png.png")
     said = _import(folder, tmp_path / "scene", f"--mask_folder={folder / 'masks'}")
-    assert "warning: 1 photographs have no mask, such as images/frame_00005.png." in said
+    assert "Left out: 1 photographs without a mask, such as images/frame_00005.png." in said
     frames = scene_folder.read_frames(tmp_path / "scene", "train")
-    marked = scene_folder.read_masks(frames).any(axis=(1, 2))
-    assert np.flatnonzero(~marked).tolist() == [4]
+    assert len(frames.names) == 7 and scene_folder.read_masks(frames).any(axis=(1, 2)).all()
     (tmp_path / "none").mkdir()
     error = _import(folder, tmp_path / "x", f"--mask_folder={tmp_path / 'none'}", fails=True)
     assert "has no mask of images/frame_00000.png" in error
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [("--scale=1e300", "beyond 1e"), ("--scale=1e-300", "All cameras are at one place")],
+)
+def test_a_world_that_no_scene_can_hold_is_refused(folder, tmp_path, option, message):
+    assert message in _import(folder, tmp_path / "scene", option, "--centre=0,0,0", fails=True)
+    assert not (tmp_path / "scene").exists()
 
 
 def test_a_smaller_width(folder, tmp_path):

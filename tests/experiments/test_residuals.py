@@ -91,8 +91,14 @@ def test_inside_and_beside_are_apart():
     found = residuals.of_view(rendered, target, mask)
     assert found.beside.length < 0.01
     np.testing.assert_allclose(found.inside.shift, [0.4, 0.0], atol=0.02)
-    without = residuals.of_view(rendered, target, None)
-    assert without.inside is None and without.rim is None and 0.0 < without.beside.length < 0.4
+    assert residuals.of_view(rendered, target, None) == Residuals(None, None, None, None)
+
+
+def test_exposure_and_white_balance_are_no_displacement():
+    rendered, target = _displaced(right=0.3)
+    found = residuals.motion(rendered, target * [0.8, 0.9, 1.1], _ALL)
+    np.testing.assert_allclose(found.shift, [0.3, 0.0], atol=0.03)
+    assert abs(found.growth * found.reach) < 0.03
 
 
 def _motion(*, right=0.0, growth=0.0, deviation=0.001):
@@ -112,6 +118,7 @@ def _views(beside, inside, *, rim=0.03, interior=0.02):
         (_views(_motion(right=-0.3), _motion(right=2.0)), ["shifted by 0.30", "cameras"]),
         (_views(_motion(right=0.3, deviation=0.1), _motion()), None),
         (_views(_motion(growth=-0.01), _motion(growth=0.1)), ["smaller", "0.50", "background"]),
+        (_views(_motion(right=0.06, growth=-0.01), _motion()), ["smaller", "background"]),
         (_views(_motion(), _motion(growth=0.01)), ["larger", "0.50", "index of refraction"]),
         (_views(_motion(), _motion(right=0.4)), ["shifted by 0.40", "experiments.align"]),
         (_views(_motion(), _motion(), rim=0.15), ["outline", "0.15", "masks"]),

@@ -119,14 +119,15 @@ def test_features_of_both_rays_are_added_by_plain_matrix_products():
     assert np.max(np.abs(found.rgb - alone.rgb)) > 1e-4
 
 
-def test_samples_are_those_of_both_rays_seen_from_the_first():
+@pytest.mark.parametrize("space", ["bounded", "spherical", "unbounded"])
+def test_samples_are_those_of_both_rays_seen_from_the_first(space):
     params, count = _trained(), 5
     places, _ = _points([0.1, 0.2, -0.15], count)
     gaussians = Gaussians(places[:, None].repeat(2, 1), jnp.full((count, 2), 0.01))
     towards = jnp.tile(_direction(), (count, 1))
     none = jnp.zeros(count)
     points = PolylinePoint(places, towards, none, none < 1.0, jnp.zeros((count, 2, 3)))
-    domain = Domain(2.0, "bounded")
+    domain = Domain(2.0, space)
     moved, seen, bent = learned_media.move(params, _CONFIG, domain, gaussians, points, _ONE)
     assert moved.positions.shape == (count, 4, 3) and moved.scales.shape == (count, 4)
     np.testing.assert_array_equal(moved.positions[:, :2], gaussians.positions)
@@ -137,7 +138,8 @@ def test_samples_are_those_of_both_rays_seen_from_the_first():
         atol=1e-6,
     )
     np.testing.assert_array_equal(seen.direction, towards)
-    np.testing.assert_allclose(bent.offsets, offsets, atol=3e-6)
+    radii = 2.0 if space == "unbounded" else 1.0  # per half edge of the cube
+    np.testing.assert_allclose(bent.offsets, radii * offsets, atol=3e-6)
 
 
 def test_gradients_are_numerical():

@@ -91,6 +91,8 @@ def _distorted(key, value, frame=None):
         (_distorted("val_filenames", ["images/frame_00001.png"]), "lists no train_filenames"),
         (_distorted("applied_transform", [[2, 0, 0, 0]]), "applied_transform .* 4 x 4 matrix"),
         (_distorted("applied_scale", -1.0), "applied_scale is -1"),
+        (_distorted("train_filenames", 5), "train_filenames is 5 in .*Give a list of names"),
+        (_distorted("file_path", "./images/frame_00001.png", 2), "lists .*frame_00001.png twice"),
         (lambda content: content.pop("fl_x") + content.pop("fl_y"), "lacks the focal length"),
     ],
 )

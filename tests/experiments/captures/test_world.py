@@ -159,7 +159,21 @@ def test_masks_that_show_no_object_are_refused():
     cameras = orbit(6, distance=4.0, elevation=0.5, size=32, angle_x=1.0)
     with pytest.raises(SceneError, match="No mask marks the object"):
         ball_of_masks(np.zeros((6, 32, 32), bool), cameras)
+    with pytest.raises(SceneError, match=r"mark 100 % of the pixels.*--masks"):
+        ball_of_masks(np.ones((6, 32, 32), bool), cameras)
     corners = np.zeros((6, 32, 32), bool)
     corners[::2, :3, :3] = corners[1::2, -3:, -3:] = True
     with pytest.raises(SceneError, match="no point in common"):
         ball_of_masks(corners, cameras)
+
+
+@pytest.mark.parametrize(
+    ("views", "of", "reason"),
+    [(3, 120, "within 6 degrees"), (10, 120, "within 26 degrees"), (5, 5, "have a radius of 2")],
+)
+def test_views_that_leave_the_place_of_the_object_unknown_are_refused(views, of, reason):
+    whole = orbit(of, distance=4.0, elevation=0.3, size=64, angle_x=1.0)
+    some = whole._replace(poses=whole.poses[:views])
+    masks = _masks_of_a_ball(some, np.zeros(3), 1.4)
+    with pytest.raises(SceneError, match=rf"{views} masks leave .*place unknown.*{reason}"):
+        ball_of_masks(masks, some)
