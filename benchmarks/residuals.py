@@ -79,7 +79,7 @@ def main(arguments: list[str]) -> None:
                 wrong.append(f"{row.scene}: {name} leads to '{row.warnings}'")
     with (out / "residuals.csv").open("w", newline="", encoding="utf-8") as file:
         csv.writer(file, lineterminator="\n").writerows([Row._fields, *rows])
-    print(f"Measures: {out / 'residual_symptoms.csv'}")
+    print(f"Measures: {out / 'residuals.csv'}")
     assert not wrong, "; ".join(wrong)
 
 
