@@ -27,11 +27,14 @@ _APART = 3
 _FEWEST = 200
 _SINGULAR = 1e8
 
-
 # Least displacements that lead to a warning, pixels: a tenth of a pixel costs about a decibel. They
 # must be larger than this many standard deviations, too.
 _SHIFTED, _GROWN, _MOVED = 0.05, 0.1, 0.1
 _CERTAIN = 5.0
+
+# Least share of the squared residuals that a displacement must explain: of the blur of a field that
+# is not trained yet it explains less.
+_EXPLAINED = 0.05
 
 # Share of the larger of growth and shift below which the other one is left out.
 _LESSER = 0.25
@@ -48,12 +51,14 @@ class Motion(NamedTuple):
       growth: magnification less 1 about the centre of the pixels.
       deviation: standard deviation of the shift if residuals were independent, pixels.
       reach: root mean square distance of the pixels from their centre.
+      explained: share of the squared residuals that the motion explains beyond gains.
     """
 
     shift: Float[np.ndarray, "2"]
     growth: float
     deviation: float
     reach: float
+    explained: float = 1.0
 
     @property
     def length(self) -> float:
@@ -133,10 +138,13 @@ def motion(
         return None
     found = np.linalg.solve(normal, design.T @ wanted)
     left = wanted - design @ found
+    gain = np.linalg.lstsq(design[:, 3:], wanted, rcond=None)[0]
+    alone = float(np.sum(np.square(wanted - design[:, 3:] @ gain)))
+    explained = 1.0 - float(np.sum(np.square(left))) / alone if alone > 0.0 else 0.0
     covariance = np.linalg.inv(normal) * np.mean(np.square(left))
     reach = float(np.sqrt(np.mean(np.sum(np.square(offsets), axis=-1))))
     deviation = float(np.sqrt(np.trace(covariance[:2, :2])))
-    return Motion(found[:2], float(found[2]), deviation, reach)
+    return Motion(found[:2], float(found[2]), deviation, reach, explained)
 
 
 def _rms(errors: Float[np.ndarray, " n"]) -> float | None:
@@ -208,8 +216,8 @@ def _growth(motion: Motion) -> float:
 
 
 def _typical(motions: Sequence[Motion], amount: Callable[[Motion], float]) -> float:
-    """Returns the median of an amount, 0 if there is none or it may be noise."""
-    if not motions:
+    """Returns the median of an amount, 0 if there is none, or it may be noise or blur."""
+    if not motions or np.median([motion.explained for motion in motions]) < _EXPLAINED:
         return 0.0
     found = float(np.median([amount(motion) for motion in motions]))
     noise = float(np.median([motion.deviation for motion in motions]))

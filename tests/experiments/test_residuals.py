@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import scipy.ndimage
 
 from experiments.runs import residuals
 from experiments.runs.residuals import Motion, Residuals
@@ -81,6 +82,17 @@ def _few(row, column):
 def test_what_says_nothing_is_unknown(image):
     rendered, among = image(*np.indices((_SIZE, _SIZE)).astype(np.float64))
     assert residuals.motion(rendered, rendered, among) is None
+
+
+def test_a_motion_explains_displaced_images_and_not_other_faults():
+    rendered, target = _displaced(right=0.3)
+    assert residuals.motion(rendered, target, _ALL).explained > 0.99
+    fault = 0.2 * np.random.default_rng(0).normal(size=target.shape)
+    noisy = residuals.motion(rendered, target + scipy.ndimage.gaussian_filter(fault, 1.0), _ALL)
+    assert 0.0 <= noisy.explained < 0.9
+    assert residuals.motion(rendered, rendered, _ALL).explained == 0.0
+    assert not residuals.warnings([Residuals(noisy._replace(explained=0.04), None, None, None)])
+    assert residuals.warnings([Residuals(noisy._replace(explained=0.06), None, None, None)])
 
 
 def test_inside_and_beside_are_apart():
