@@ -300,8 +300,8 @@ def _bake(job: dict[str, Any], stage: Path, blender: Path) -> dict[str, np.ndarr
             f"Blender {BLENDER} cannot bake the room's light ({said}). Run make dataset-env, or "
             "give the Python of an environment with bpy as --blender."
         )
-    with np.load(made) as arrays:
-        baked = {name: room.without_noise(light) for name, light in arrays.items()}
+    arrays = atomic_files.read_arrays(made)
+    baked = {name: room.without_noise(light) for name, light in arrays.items()}
     source.unlink()
     made.unlink()
     return baked

@@ -44,10 +44,12 @@ def test_some_steps_lower_the_loss_and_bend_rays(trained):
     names = ("bends", "turns", "offsets")
     assert all(np.isfinite([line[name] for name in names]).all() for line in lines)
     kind = trained[0].config.field.kind
-    assert (lines[0]["offsets"] == 0.0) == (kind == "rosenerf")  # which begins without
+    assert (lines[0]["offsets"] < 1e-12) == (kind == "rosenerf")  # which begins without
     assert lines[-1]["offsets"] > 10.0 * lines[2]["offsets"] > 0.0
-    # The directions of a polyline are those of its segments, and a second ray is straight.
-    assert (max(abs(line["turns"]) for line in lines) < 1e-5) == (kind != "raydef")
+    # The directions of a polyline are those of its segments. A second ray is straight, but samples
+    # stay within the scene.
+    most, least = max(abs(line["turns"]) for line in lines), {"raydef": 1e-5}.get(kind, -1.0)
+    assert least < most < {"raydef": 1.0, "raydef_polyline": 1e-5, "rosenerf": 1e-3}[kind]
 
 
 def test_a_checkpoint_is_read_and_rendered(trained):
