@@ -152,7 +152,7 @@ def errors(
     return np.degrees(turned), 100.0 * moved / distance
 
 
-def measure(made: Generated, tell: Callable[[str], None] = print) -> list[Measured]:
+def measure(made: Generated, report: Callable[[str], None] = print) -> list[Measured]:
     """Returns the rows of a capture: given poses, and refined by perfect and by taken images."""
     true, views = made.poses(true=True), made.views()
     test = np.array([frame["split"] == "test" for frame in made.truth["frames"]])
@@ -170,9 +170,9 @@ def measure(made: Generated, tell: Callable[[str], None] = print) -> list[Measur
     prior = Prior(math.radians(_PRIOR_DEGREES), 0.01 * _PRIOR_PERCENT * distance)
     for name, photos in (("perfect", perfect_photos(made)), ("photographs", flat_photos(made))):
         started = time.monotonic()
-        refined = refinement.refine(views, photos, prior=prior, tell=tell)
+        refined = refinement.refine(views, photos, prior=prior, report=report)
         rows.append(row(name, "refined", refined.poses, time.monotonic() - started))
-        tell(str(rows[-1]))
+        report(str(rows[-1]))
     return rows
 
 

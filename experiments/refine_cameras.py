@@ -50,7 +50,7 @@ def main() -> None:
     before = refined_scene.read(scene)
     distance = refined_scene.mean_distance(before.views)
     prior = bundle.Prior(math.radians(_DEGREES.value), 0.01 * _PERCENT.value * distance)
-    refined = refinement.refine(before.views, before.photos, prior=prior, tell=print)
+    refined = refinement.refine(before.views, before.photos, prior=prior, report=print)
     refined_scene.write(scene, out, before, refined)
     turned = np.degrees(np.linalg.norm(refined.corrections[:, :3], axis=-1))
     moved = 100.0 * np.linalg.norm(refined.corrections[:, 3:], axis=-1) / distance

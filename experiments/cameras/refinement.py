@@ -74,7 +74,7 @@ def refine(
     photos: Sequence[Photo],
     *,
     prior: Prior,
-    tell: Callable[[str], None] = lambda _: None,
+    report: Callable[[str], None] = lambda _: None,
 ) -> Refined:
     """Returns refined poses of views.
 
@@ -82,7 +82,7 @@ def refine(
       views: views with the given poses.
       photos: their images.
       prior: how wrong given poses are.
-      tell: function that receives progress in words.
+      report: function that receives progress and warnings, as lines of text.
 
     Raises:
       ValueError: if most views show too few points beside the object, or all are at one place.
@@ -95,23 +95,23 @@ def refine(
     ]
     pairs = neighbours(views)
     shown = np.array([len(each.places) for each in found])
-    tell(f"{shown.sum()} corners, {len(pairs)} pairs of views")
+    report(f"{shown.sum()} corners, {len(pairs)} pairs of views")
     if np.median(shown) < _FEWEST or not len(pairs):
-        _judge(np.zeros_like(shown), tell)
+        _judge(np.zeros_like(shown), report)
     seen = _tracks(views, found, pairs, prior)
     if not len(seen.view):
-        _judge(np.zeros_like(shown), tell)
+        _judge(np.zeros_like(shown), report)
     solution, seen = _solve(views, seen, prior, _LARGEST_ERRORS[0])
-    tell(_describe("corners", solution, seen))
+    report(_describe("corners", solution, seen))
     for _ in range(2):
         seen = _aligned(solution, seen, greys, usable, pairs)
         start = solution.views
         solution, seen = _solve(
             views, seen, prior, _LARGEST_ERRORS[1], start=start, points=solution.points
         )
-        tell(_describe("patches", solution, seen))
+        report(_describe("patches", solution, seen))
     shown = np.bincount(seen.view, minlength=len(views.poses))
-    _judge(shown, tell)
+    _judge(shown, report)
     known = shown >= _FEWEST
     change = bundle.similarity(solution.views.poses[known], views.poses[known])
     # A pose that few points determine is more likely wrong than the given one.
@@ -127,8 +127,8 @@ def refine(
     )
 
 
-def _judge(shown: Int[np.ndarray, " views"], tell: Callable[[str], None]) -> None:
-    """Refuses a refinement of most views by too few points, and tells of single ones."""
+def _judge(shown: Int[np.ndarray, " views"], report: Callable[[str], None]) -> None:
+    """Refuses a refinement of most views by too few points, and warns of single ones."""
     few = np.nonzero(shown < _FEWEST)[0]
     if 2 * len(few) > len(shown):
         raise ValueError(
@@ -137,7 +137,7 @@ def _judge(shown: Int[np.ndarray, " views"], tell: Callable[[str], None]) -> Non
         )
     if len(few):
         names = ", ".join(map(str, few[:8]))
-        tell(
+        report(
             f"warning: {len(few)} views show fewer than {_FEWEST} points beside the object (views "
             f"{names}, from 0, split after split), and keep their poses."
         )
@@ -192,8 +192,8 @@ def _tracks(
     # A point that a view shows twice is none.
     keys = point * len(found) + view
     twice = np.bincount(keys, minlength=keys.max(initial=0) + 1)[keys] > 1
-    spoilt = np.isin(point, point[twice])
-    return _renumbered(Sightings(view, point, places), ~spoilt)
+    doubled = np.isin(point, point[twice])
+    return _renumbered(Sightings(view, point, places), ~doubled)
 
 
 def _renumbered(seen: Sightings, kept: np.ndarray) -> Sightings:

@@ -117,7 +117,7 @@ def test_a_view_of_nothing_keeps_its_pose_and_a_scene_of_nothing_is_refused(room
     blank = [photo._replace(image=np.full_like(photo.image, 90)) for photo in photos]
     told = []
     refined = refinement.refine(
-        views, [*blank[:1], *photos[1:]], prior=Prior(0.006, 0.015), tell=told.append
+        views, [*blank[:1], *photos[1:]], prior=Prior(0.006, 0.015), report=told.append
     )
     assert refined.sightings[0] == 0
     np.testing.assert_array_equal(refined.poses[0], views.poses[0])
