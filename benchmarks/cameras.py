@@ -32,6 +32,7 @@ from jaxtyping import Bool, Float, UInt8
 from experiments.cameras import bundle, refined_scene, refinement
 from experiments.cameras.bundle import Prior, Views
 from experiments.cameras.refinement import Photo
+from experiments.captures.lenses import Distortion, distort
 from refref_jax.data import image_files
 
 _CAPTURES = flags.DEFINE_list("captures", None, "Folders of make_capture.", required=True)
@@ -121,7 +122,8 @@ def flattened(
     size = len(image)
     ticks = np.arange(size) + 0.5 - 0.5 * size
     towards = np.stack(np.meshgrid(ticks, ticks), axis=-1) / lens["focal"]
-    at = lens["focal"] * _bent(lens, towards) + [lens["centre_x"], lens["centre_y"]] - 0.5
+    distortion = Distortion(radial=(lens["k1"], lens["k2"]), tangential=(lens["p1"], lens["p2"]))
+    at = lens["focal"] * distort(distortion, towards) + [lens["centre_x"], lens["centre_y"]] - 0.5
     order = 1 if image.ndim == 2 else 3
     values = np.atleast_3d(image).astype(np.float64)
     channels = [
@@ -129,16 +131,6 @@ def flattened(
         for each in np.moveaxis(values, -1, 0)
     ]
     return np.stack(channels, axis=-1).reshape(*image.shape)
-
-
-def _bent(lens: dict[str, float], towards: np.ndarray) -> np.ndarray:
-    """Returns where a lens images directions of unit depth (OpenCV's model)."""
-    x, y = towards[..., 0], towards[..., 1]
-    squared, product = x * x + y * y, x * y
-    radial = 1.0 + lens["k1"] * squared + lens["k2"] * squared**2
-    across = x * radial + 2.0 * lens["p1"] * product + lens["p2"] * (squared + 2.0 * x * x)
-    down = y * radial + lens["p1"] * (squared + 2.0 * y * y) + 2.0 * lens["p2"] * product
-    return np.stack([across, down], axis=-1)
 
 
 def errors(
