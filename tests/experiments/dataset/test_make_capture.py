@@ -8,9 +8,9 @@ import json
 import imageio.v3 as iio
 import numpy as np
 import pytest
-from refref_jax.data.nerfstudio import capture as nerfstudio
 
 from benchmarks import cameras as benchmark
+from experiments.captures import nerfstudio
 from experiments.dataset import captures, frame_files, handheld
 from refref_jax.data import image_files, scene_folder
 from refref_jax.geometry.cameras import box_filter, image_rays
