@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from refref_jax.geometry.triangle_meshes import make_mesh, volume
-from refref_jax.reconstruct import ReconstructionError, gauss_newton, photometry
+from refref_jax.reconstruct import ReconstructionError, free_vessels, gauss_newton, photometry
 from refref_jax.reconstruct.contents import Interior
 from refref_jax.reconstruct.free_vessels import FreeVessel, distances_inside
 from refref_jax.reconstruct.mesh_distance import signed_distance
@@ -22,7 +22,10 @@ def mesh():
 
 @pytest.fixture(scope="module")
 def inside(mesh):
-    return distances_inside(mesh)
+    """Distances on a coarser grid than usual, in a third of the time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(free_vessels, "_SPACING", 1.5 * free_vessels._SPACING)
+        return distances_inside(mesh)
 
 
 @pytest.fixture(scope="module")

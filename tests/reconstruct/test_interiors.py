@@ -285,6 +285,7 @@ def test_levels_are_looked_at_again_with_both_mouths(body, surface, photographs,
     assert not closed.mouth
 
 
+@pytest.mark.slow
 def test_bases_lids_and_punts_are_looked_at(body, surface, small_tiles):
     del small_tiles
     truth = Interior("air", wall=0.08, base=0.72, lid=0.3, punt=0.08)

@@ -54,6 +54,7 @@ def _painted(body, pixels, *ends):
     return pixels._replace(rgb=np.clip(rgb + noise, 0.0, 1.0))
 
 
+@pytest.mark.slow
 def test_a_cap_is_found_where_it_is(body, surface, clear):
     cap = _cap(body, 0.55)
     (found,) = find_opaque_ends(body, surface, _painted(body, clear, cap))

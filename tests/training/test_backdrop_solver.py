@@ -199,6 +199,7 @@ def test_pixels_without_light_leave_the_radiance_finite(throughput):
     assert all(np.all(np.isfinite(level)) for level in last.pyramid)
 
 
+@pytest.mark.slow
 def test_tints_are_found_with_the_radiance():
     tint = (0.9, 0.7, 0.5)
     body = scenes.ball(1.3, subdivisions=2)

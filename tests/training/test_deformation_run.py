@@ -28,13 +28,7 @@ def _config(**changes):
     return TrainConfig().override(scene=str(_SCENE), pretraced_batches=4, **small, **given)
 
 
-@pytest.fixture(
-    scope="module",
-    params=[
-        "raydef",
-        *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("raydef_polyline", "rosenerf")),
-    ],
-)
+@pytest.fixture(scope="module", params=["raydef", "raydef_polyline", "rosenerf"])
 def trained(request, tmp_path_factory):
     """A model, and the folder of its run."""
     run = tmp_path_factory.mktemp(request.param) / "run"
@@ -43,6 +37,7 @@ def trained(request, tmp_path_factory):
     return checkpoint_io.load_model(run), run
 
 
+@pytest.mark.slow
 def test_some_steps_lower_the_loss_and_bend_rays(trained):
     lines = run_folder.read_metrics(trained[1])
     losses = [line["loss"] for line in lines]
@@ -58,6 +53,7 @@ def test_some_steps_lower_the_loss_and_bend_rays(trained):
     assert least < most < {"raydef": 1.0, "raydef_polyline": 1e-5, "rosenerf": 1e-3}[kind]
 
 
+@pytest.mark.slow
 def test_a_checkpoint_is_read_and_rendered(trained):
     read, run = trained
     assert (read.config, read.settings) == tuple(vars(checkpoint_io.read_static(run)).values())

@@ -125,6 +125,7 @@ def test_a_run_is_resumed_with_its_scene_where_it_is_now_and_all_is_reported(
     assert capsys.readouterr().out == ""
 
 
+@pytest.mark.slow
 def test_fit_takes_objects_in_place_of_the_meshes_and_stops_when_it_is_asked_to(tmp_path):
     scene = ROOT / "experiments" / "data" / "cube_smcvx_ball"
     (part,) = meshes.read_meshes(scene)

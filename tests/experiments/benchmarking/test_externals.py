@@ -184,6 +184,7 @@ def test_the_report_shows_it_like_the_others(tmp_path):
     assert sheets.write(out) == [out / sheets.SHEET, out / sheets.GRID]
 
 
+@pytest.mark.slow
 def test_the_command_adds_it_without_training_it(tmp_path, serve, scenes):
     for name in _SCENES:
         write_renderings(tmp_path / "mine" / name, tmp_path / "scenes" / name)
