@@ -198,6 +198,12 @@ def _read(source: Path) -> tuple[Capture, tuple[str, ...], bool]:
         capture = nerfstudio.read_capture(source)
     else:
         capture = colmap.read_capture(model, _image_folder(source, model))
+        if others := colmap.other_models(model):
+            print(
+                f"warning: {model} is read, with {len(capture.frames)} images, but not "
+                f"{', '.join(str(other) for other in others)}. Each has its own world; --source "
+                "takes another, with --images."
+            )
     if _MASKS.value == "none":
         return capture, (), model is not None
     if _MASK_FOLDER.value is not None:

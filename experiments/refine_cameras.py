@@ -17,7 +17,7 @@ from pathlib import Path
 from absl import flags
 from etils import epy
 
-from experiments.cli import app
+from experiments.cli import app, outputs
 from experiments.cli import flags as cli_flags
 from experiments.cli import scenes as cli_scenes
 
@@ -47,6 +47,7 @@ def main() -> None:
     cli_scenes.check(_SCENE.value)
     scene, out = cli_scenes.opened(_SCENE.value), Path(_OUT.value)
     refined_scene.check_place(scene, out)
+    outputs.check_folder(out)
     before = refined_scene.read(scene)
     distance = refined_scene.mean_distance(before.views)
     prior = bundle.Prior(math.radians(_DEGREES.value), 0.01 * _PERCENT.value * distance)

@@ -69,6 +69,14 @@ def find_model(source: Path) -> Path | None:
     return None
 
 
+def other_models(model: Path) -> list[Path]:
+    """Returns the models beside one; COLMAP's mapper numbers those that it could not join."""
+    if not model.name.isdecimal():
+        return []
+    numbered = (each for each in model.parent.iterdir() if each.name.isdecimal())
+    return sorted(each for each in numbered if each != model and find_model(each) == each)
+
+
 def read_capture(model: Path, images: Path) -> Capture:
     """Reads a model, and the size of each of its images, but no pixels.
 

@@ -227,7 +227,11 @@ def _points(content: dict[str, Any], path: Path) -> PointCloud | None:
         return None
     name = scene_folder.get_text(content, "ply_file_path", path)
     file = file_inside([path.parent], name, where="ply_file_path", path=path)
-    return read_points(file) if file.is_file() else None
+    if not file.is_file():
+        raise SceneError(
+            f"{file} does not exist, but {path} names it. Copy it there, or remove ply_file_path."
+        )
+    return read_points(file)
 
 
 def write_capture(

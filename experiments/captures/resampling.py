@@ -249,6 +249,7 @@ def _common_rectangle(frames: Sequence[Frame]) -> tuple[np.ndarray, str]:
     groups = {(frame.lens, frame.turned): frame for frame in reversed(frames)}.values()
     ends = []
     for frame in groups:
+        _refuse_axis_outside(frame)
         shape = np.array(_turned(half, frame.turned))
         end = lenses.extent(frame.lens, np.zeros(2), shape, most=most)
         if end.end == lenses.FOLD:
@@ -270,6 +271,16 @@ def _common_rectangle(frames: Sequence[Frame]) -> tuple[np.ndarray, str]:
         ]
         half = half + min(factors) * growing
     return half, narrowest
+
+
+def _refuse_axis_outside(frame: Frame) -> None:
+    known = frame.lens.intrinsics
+    if not (0.0 < known.centre_x < known.width and 0.0 < known.centre_y < known.height):
+        raise SceneError(
+            f"The principal point of {frame.name} is ({known.centre_x:g}, {known.centre_y:g}), "
+            f"outside of its {known.width} x {known.height} pixels. Check its intrinsics, or leave "
+            "it out."
+        )
 
 
 def _refuse_fold(frame: Frame, tangent: float) -> None:

@@ -80,6 +80,7 @@ class CaptureSettings:
       pose_percent: error of positions, root mean square, percent of the distance.
       mask_pixels: largest error of the edges of masks, pixels.
       missing_masks: number of training images without a mask.
+      texture_scale: width of the room's textures, see `room.furnish`.
     """
 
     object: str = "ball"
@@ -92,6 +93,7 @@ class CaptureSettings:
     pose_percent: float = 0.5
     mask_pixels: float = 2.0
     missing_masks: int = 3
+    texture_scale: float = 1.0
 
     def __post_init__(self) -> None:
         """Rejects numbers of views and masks that do not fit.
@@ -198,13 +200,15 @@ def check(out: Path, settings: CaptureSettings) -> None:
             raise ValueError(f"{out} is not a folder of this command. Give another --out.")
         return
     found = configuration.parse_json(path.read_text(encoding="utf-8")).get("settings")
-    wanted = dataclasses.asdict(settings)
-    for name, value in wanted.items():
-        if not isinstance(found, dict) or found.get(name) != value:
-            before = found.get(name) if isinstance(found, dict) else None
+    if not isinstance(found, dict):
+        raise ValueError(f"{path} states no settings. Give another --out.")
+    # Settings that a folder does not state are newer than it.
+    before = dataclasses.asdict(CaptureSettings()) | found
+    for name, value in dataclasses.asdict(settings).items():
+        if before[name] != value:
             raise ValueError(
-                f"{path} has other settings: {name} is {before}, not {value}. Give the same ones "
-                "to resume, or another --out."
+                f"{path} has other settings: {name} is {before[name]}, not {value}. Give the same "
+                "ones to resume, or another --out."
             )
 
 
@@ -223,7 +227,8 @@ def _set_up(out: Path, settings: CaptureSettings, *, blender: Path, scratch: Pat
     for split in SPLITS:
         if settings.numbers(split):
             _write_json(perfect / f"transforms_{split}.json", _perfect_transforms(settings, split))
-    surfaces = room.furnish(min(part.vertices[:, 2].min() for part in parts))
+    bottom = min(part.vertices[:, 2].min() for part in parts)
+    surfaces = room.furnish(bottom, texture_scale=settings.texture_scale)
     _light_room(stage, record, surfaces, settings, blender=blender)
     _write_json(scratch / TRUTH / _FILE, describe_truth(settings))
     for name in (PERFECT, TRUTH):

@@ -39,6 +39,13 @@ _MASK = flags.DEFINE_float("mask_pixels", 2.0, "Largest error of masks' edges, p
 _MISSING = flags.DEFINE_integer(
     "missing_masks", 3, "Training images that have no mask.", lower_bound=0
 )
+_TEXTURE_SCALE = flags.DEFINE_float(
+    "texture_scale",
+    1.0,
+    "Width of the room's textures; at 1, details are as fine as pixels of a view of 160 x 160.",
+    0.1,
+    10.0,
+)
 _WORKERS = flags.DEFINE_integer(
     "workers", None, "Number of Blender processes; one for each core if not given.", lower_bound=1
 )
@@ -60,6 +67,7 @@ def main() -> None:
         pose_percent=_PERCENT.value,
         mask_pixels=_MASK.value,
         missing_masks=_MISSING.value,
+        texture_scale=_TEXTURE_SCALE.value,
     )
     blender = Path(_BLENDER.value).absolute()
     if not blender.is_file():

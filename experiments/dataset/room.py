@@ -99,16 +99,21 @@ class Surface(NamedTuple):
 _WOOD = Look(None, colour=(0.16, 0.08, 0.04))
 
 
-def furnish(bottom: float) -> list[Surface]:
+def furnish(bottom: float, *, texture_scale: float = 1.0) -> list[Surface]:
     """Returns the surfaces of the room around an object.
 
     Args:
       bottom: height of the lowest point of the object, which stands on the table.
+      texture_scale: factor of the width of images that are repeated. At 1, their details are as
+        fine as the pixels of a view of 160 x 160 pixels.
     """
     top = bottom - _GAP
     shell = _shell(top + FLOOR, top + CEILING)
     things = [*_table(top), *_shelves(top + FLOOR), *_crates(top + FLOOR), *_pictures(top)]
-    return [*shell, *_lights(top), *things]
+    return [
+        each._replace(look=each.look._replace(width=texture_scale * each.look.width))
+        for each in (*shell, *_lights(top), *things)
+    ]
 
 
 def paint(

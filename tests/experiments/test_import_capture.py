@@ -327,6 +327,8 @@ def _folds(content):
     ("options", "change", "message"),
     [
         ((), _folds, "images/frame_00001.png folds at most"),
+        ((), lambda c: c.update(k1=0.1, cx=1e9), "is (1e+09, 5), outside of its 12 x 10 pixels"),
+        ((), lambda c: c.update(ply_file_path="gone.ply"), "gone.ply does not exist, but"),
         ((), lambda c: c.update(fl_x=1e-9, fl_y=1e-9), "The focal length is 1e-09 pixels for imag"),
         (("--width=20000",), None, "Images of 20000 x 16666 pixels are too large"),
         (("--centre=meshes",), None, "there are no meshes. Give their folder: --meshes."),

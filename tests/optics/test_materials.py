@@ -210,7 +210,9 @@ def test_a_rough_surface_adds_no_light_and_scatters_around_the_mirror(roughness)
     assert abs(np.mean(sideways)) < 0.05 and 0.1 < spread / roughness**2 < 6.0
 
 
-@pytest.mark.parametrize("number", [pytest.param(4, marks=pytest.mark.slow), 64])
+@pytest.mark.parametrize(
+    "number", [pytest.param(number, marks=pytest.mark.slow) for number in (4, 64)]
+)
 def test_the_footprint_behind_a_rough_surface_reaches_the_next_facet(number):
     rough = Material("conductor", roughness=0.3, complex_index=_GOLD)
     rays = _rays(0.0)._replace(strata=jnp.array([[0, 0, number]], jnp.int32))

@@ -238,6 +238,7 @@ def test_nothing_is_found_before_a_grey_wall():
 
 
 @pytest.mark.longest
+@pytest.mark.slow
 def test_a_dent_of_the_surface_is_no_bubble(world):
     glass = _icosphere(_ORIGIN, 1.0, 5)
     away = np.arccos(np.clip(glass.vertices @ np.array([0.0, 0.6, 0.8]), -1.0, 1.0))

@@ -327,7 +327,7 @@ def test_handles_of_a_free_surface_have_the_slopes_of_predictions(world, ball):
     assert np.sum(slopes * expected) / np.sum(slopes**2) == pytest.approx(1.0, abs=0.05)
 
 
-@pytest.mark.parametrize("true", [1.5, 1.62])
+@pytest.mark.parametrize("true", [1.5, pytest.param(1.62, marks=pytest.mark.slow)])
 def test_the_index_is_found_from_a_wrong_start(world, ball, true):
     search = IndexSearch(1.3, 1.8, spacing=0.1, descents=1)
     told = []
@@ -401,6 +401,7 @@ def _turned(mesh):
     return np.degrees(np.sqrt(np.mean(np.arccos(np.clip(cosine, -1.0, 1.0)) ** 2)))
 
 
+@pytest.mark.slow
 def test_a_free_surface_loses_a_dent_that_no_outline_shows(world, ball, seen, judges):
     mesh = _dented(ball)
     model = SingleObject(FreeSurface(mesh, 0.16), _INDEX)
@@ -448,6 +449,7 @@ def _one_family(monkeypatch, shape, mesh):
     monkeypatch.setattr(families, "candidates", lambda _: [shape, coarse(mesh)])
 
 
+@pytest.mark.slow
 def test_a_family_is_chosen_where_it_explains_the_judges(world, ball, seen, judges, monkeypatch):
     mesh, told = _dented(ball), []
     _one_family(monkeypatch, Sphere(np.array([0.004, 0.0, -0.005]), 0.995), mesh)

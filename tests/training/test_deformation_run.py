@@ -28,7 +28,13 @@ def _config(**changes):
     return TrainConfig().override(scene=str(_SCENE), pretraced_batches=4, **small, **given)
 
 
-@pytest.fixture(scope="module", params=["raydef", "raydef_polyline", "rosenerf"])
+@pytest.fixture(
+    scope="module",
+    params=[
+        "raydef",
+        *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("raydef_polyline", "rosenerf")),
+    ],
+)
 def trained(request, tmp_path_factory):
     """A model, and the folder of its run."""
     run = tmp_path_factory.mktemp(request.param) / "run"
@@ -61,6 +67,7 @@ def test_a_checkpoint_is_read_and_rendered(trained):
     assert np.all(np.isfinite(image.rgb)) and np.all(image.distance > 0.0)
 
 
+@pytest.mark.slow
 def test_commands_name_the_kind_of_field(trained, tmp_path):
     made, run = trained
     kind = made.config.field.kind

@@ -97,6 +97,7 @@ def trained(tmp_path_factory):
     return made, run
 
 
+@pytest.mark.slow
 def test_the_surface_is_learned_in_both_parts(trained):
     lines = run_folder.read_metrics(trained[1])
     losses = [line["loss"] for line in lines]
@@ -108,6 +109,7 @@ def test_the_surface_is_learned_in_both_parts(trained):
     assert trained[0].params.field.index_change != 0.0
 
 
+@pytest.mark.slow
 def test_a_checkpoint_is_read_with_its_surface(trained):
     made, run = trained
     read = checkpoint_io.load_model(run)
@@ -119,6 +121,7 @@ def test_a_checkpoint_is_read_with_its_surface(trained):
         np.testing.assert_array_equal(ours, theirs)
 
 
+@pytest.mark.slow
 def test_the_first_surface_is_the_level_set(trained):
     model = trained[0]
     ball = ball_of(model.config)
@@ -134,6 +137,7 @@ def test_the_first_surface_is_the_level_set(trained):
     assert np.all(np.isinf(away.distances)) and np.all(away.parts == images.NO_PART)
 
 
+@pytest.mark.slow
 def test_commands_evaluate_render_and_export_it(trained, tmp_path):
     model, run = trained
     run_command("evaluate", f"--run={run}", "--split=val", "--limit=1")

@@ -60,6 +60,7 @@ def test_a_checkpoint_is_read_as_it_was_written(trained):
     expectations.assert_same(made.params, read.params)
 
 
+@pytest.mark.slow
 def test_a_stopped_run_is_resumed_bit_for_bit(trained, tmp_path):
     steps = iter([False, False, True])  # before the first step, then after each group of steps
     asked = {"periods": fit.Periods(log=5, checkpoint=100), "report": _quiet}
@@ -99,6 +100,7 @@ def test_what_needs_rays_or_a_field_is_refused_in_one_sentence(trained):
         images.render_camera(classic, CAMERAS, 0, rays_per_pixel=4)
 
 
+@pytest.mark.slow
 def test_commands_take_a_run(trained, tmp_path):
     run = trained[1]
     run_command("evaluate", f"--run={run}", "--split=val", "--limit=1", "--rays_per_pixel=4")

@@ -56,6 +56,7 @@ def test_a_checkpoint_is_read_as_it_was_written(trained):
     assert np.all(np.isfinite(image.rgb)) and np.all(image.distance > 0.0)
 
 
+@pytest.mark.slow
 def test_commands_name_the_kind_of_field(trained, tmp_path):
     run = trained[1]
     run_command("evaluate", f"--run={run}", "--split=val", "--limit=1")

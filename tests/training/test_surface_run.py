@@ -179,6 +179,7 @@ def test_a_checkpoint_is_read_as_it_was_written(trained):
         np.testing.assert_array_equal(ours, theirs)
 
 
+@pytest.mark.slow
 def test_the_viewer_shows_normals(trained):
     model = trained[0]
     assert layers.offered(model, truth=False) == ("rgb", "distance", "normals")
@@ -194,6 +195,7 @@ def test_the_viewer_shows_normals(trained):
     np.testing.assert_allclose(np.linalg.norm(unit, axis=-1), 1.0, atol=0.02)
 
 
+@pytest.mark.slow
 def test_commands_evaluate_and_export_the_surface(trained, tmp_path):
     model, run = trained
     run_command("evaluate", f"--run={run}", "--split=val", "--limit=1")

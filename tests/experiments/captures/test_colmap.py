@@ -96,6 +96,17 @@ def test_where_a_model_is_found(tmp_path, poses, place):
     assert colmap.find_model(tmp_path / "nowhere") is None
 
 
+def test_models_that_could_not_be_joined_are_found(tmp_path, poses):
+    for name in ("0", "1", "2"):
+        _write(tmp_path / "sparse" / name, "text", poses)
+    (tmp_path / "sparse" / "3").mkdir()
+    sparse = tmp_path / "sparse"
+    assert colmap.other_models(sparse / "0") == [sparse / "1", sparse / "2"]
+    assert colmap.other_models(sparse / "2") == [sparse / "0", sparse / "1"]
+    _write(tmp_path / "alone", "text", poses)
+    assert colmap.other_models(tmp_path / "alone") == []
+
+
 @pytest.mark.parametrize("form", _WRITERS)
 @pytest.mark.parametrize(
     ("camera", "message"),

@@ -163,6 +163,19 @@ def test_surfaces_of_the_room_surround_the_cameras_and_nothing_is_in_their_way()
         assert np.all((away < 3.3) | (away > 4.9)), surface.name
 
 
+def test_wider_textures_repeat_less_often_on_the_same_surfaces():
+    fine, wide = room.furnish(-1.4), room.furnish(-1.4, texture_scale=2.0)
+    for one, other in zip(fine, wide, strict=True):
+        assert one.name == other.name and other.look.width == 2.0 * one.look.width
+        np.testing.assert_array_equal(one.corner, other.corner)
+    light = np.ones((2, 2, 3))
+    one, other = (
+        room.paint(next(s for s in surfaces if s.name == "wall_right"), light)
+        for surfaces in (fine, wide)
+    )
+    assert np.abs(np.diff(other, axis=1)).mean() < 0.7 * np.abs(np.diff(one, axis=1)).mean()
+
+
 def test_a_surface_has_the_light_of_its_picture_times_what_arrives():
     look = room.Look(None, colour=(0.5, 0.25, 1.0))
     surface = room.Surface("a", np.zeros(3), 2.0 * np.eye(3)[0], np.eye(3)[2], look)

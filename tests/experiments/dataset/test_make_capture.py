@@ -35,6 +35,13 @@ def test_a_folder_of_other_settings_is_refused(tmp_path):
     captures.check(tmp_path / "out", settings)
     with pytest.raises(ValueError, match="views is 40, not 60"):
         captures.check(tmp_path / "out", captures.CaptureSettings())
+    earlier = captures.describe_truth(captures.CaptureSettings())
+    del earlier["settings"]["texture_scale"]
+    (truth / "truth.json").write_text(json.dumps(earlier))
+    captures.check(tmp_path / "out", captures.CaptureSettings())
+    (truth / "truth.json").write_text("{}")
+    with pytest.raises(ValueError, match="states no settings"):
+        captures.check(tmp_path / "out", captures.CaptureSettings())
     (truth / "truth.json").unlink()
     with pytest.raises(ValueError, match="not a folder of this command"):
         captures.check(tmp_path / "out", settings)
@@ -92,6 +99,23 @@ def test_the_perfect_scene_and_the_capture_are_whole(made):
         assert iio.immeta(image)["mode"] == "RGB" and image_files.read_size(image) == (160, 160)
     again = run_command("dataset.make_capture", f"--out={made}", f"--blender={_PYTHON}", "--spp=18")
     assert "render" not in again.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not _PYTHON.exists(), reason="Blender is missing: make dataset-env")
+@pytest.mark.parametrize("meshes", [False, True])
+def test_one_command_leads_from_the_capture_to_a_report(made, tmp_path, meshes):
+    out = tmp_path / "run"
+    options = [f"--source={made / captures.CAPTURE}", f"--out={out}", "--steps=400"]
+    options += [f"--meshes={made / captures.PERFECT / 'meshes'}"] if meshes else []
+    said = run_command("capture_to_model", *options, "--rays_per_pixel=1").stdout
+    assert ("Report:" in said) != meshes and (out / "object" / "report.md").is_file() != meshes
+    seen = out / "model" / "eval" / "test"
+    results = json.loads((seen / "metrics.json").read_text())["results"]
+    assert results["psnr"] > 17.0 and results["psnr_masked"] > (16.0 if meshes else 13.0)
+    assert image_files.read_rgb(seen / "comparison.png").ndim == 3
+    again = run_command("capture_to_model", *options, "--rays_per_pixel=1").stdout
+    assert again.count("done before") == (4 if meshes else 5)
 
 
 def _first_hits(surfaces, origins, directions):

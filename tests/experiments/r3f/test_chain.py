@@ -601,6 +601,7 @@ def test_a_wrong_mask_is_named_unless_one_may_be_wrong(scene, tmp_path, outliers
         assert facts.volume < 0.7 * true
 
 
+@pytest.mark.slow
 def test_views_without_the_object_are_left_out_and_counted(scene, tmp_path):
     frames = scene_folder.read_frames(scene, "train")
     trials = {name: shutil.copytree(scene, tmp_path / name) for name in ("black", "fewer")}

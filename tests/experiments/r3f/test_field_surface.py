@@ -54,6 +54,7 @@ def _radius(asked):
     return ball_of(config).radius * config.field.start
 
 
+@pytest.mark.slow
 def test_the_surface_is_the_zero_set_of_the_field(bare, untrained, tmp_path):
     grid = field_surface.find(bare, tmp_path, _CONFIG)
     mesh, radius = find_isosurface(grid), _radius(untrained)
