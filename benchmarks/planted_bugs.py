@@ -268,6 +268,16 @@ BUGS = (
         ("fields/test_neus.py::test_a_ray_that_leaves_is_not_stopped",),
     ),
     Bug(
+        "clear glass reflects what is not transmitted",
+        "fields/nunerf.py",
+        "through = clear * mirrored + (1.0 - clear) * refracted",
+        "through = clear * refracted + (1.0 - clear) * mirrored",
+        (
+            "fields/test_nunerf.py::"
+            "test_clear_glass_reflects_four_percent_head_on_and_everything_at_grazing_incidence",
+        ),
+    ),
+    Bug(
         "transmittance includes the own sample",
         _VOLUME,
         "jnp.concatenate([jnp.zeros_like(depth[:1]), jnp.cumsum(depth[:-1])])",

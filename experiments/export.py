@@ -3,7 +3,7 @@
 python -m experiments.export --run=runs/ball --what=mesh --out=ball.ply
 
     mesh      level set of the field's density at --level, and the background cube or sphere, if
-              any, with normals and colours; of a field with a surface (neus, unisurf), that surface
+              any, with normals and colours; of a field with a surface (as neus), that surface
     points    the same surfaces as points of a grid
     splats    the Gaussians of a run with --field=splats, for viewers of splats
     object    the objects: those of R3F, or the scene's meshes; with their shading normals

@@ -89,6 +89,7 @@ FieldName = Literal[
     "msnerf",
     "neus",
     "unisurf",
+    "nunerf",
     "tnsr",
     "raydef",
     "raydef_polyline",

@@ -51,9 +51,9 @@ def reconstruct(
         installed, if no object fits the masks, or if the folder contains anything else.
     """
     import_skimage()
-    if config.geometry != field_surface.NAME or field_surface.has_masks(scene):
+    if config.geometry not in field_surface.NAMES or field_surface.has_masks(scene):
         _check_masks(scene, config)
-    if config.geometry == field_surface.NAME:
+    if config.geometry in field_surface.NAMES:
         field_surface.check(scene, config)
     asked = Reconstruction(scene_names.of_folder(scene), fingerprint(scene), config)
     found = records.begin(out, asked)
@@ -61,7 +61,7 @@ def reconstruct(
         found = records.read(out)  # another process may have finished it meanwhile
         scene = field_surface.masked_scene(scene, out, config)
         if found.geometry is None or not geometry_stage.is_there(out, found.geometry):
-            read = "images" if config.geometry == field_surface.NAME else "masks"
+            read = "images" if config.geometry in field_surface.NAMES else "masks"
             say(f"geometry: {config.geometry} of the training {read}, {config.resolution} cells")
             if without := _views_without_object(scene):
                 say(f"geometry: {without} training views are left out, whose masks mark no object")

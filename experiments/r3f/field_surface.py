@@ -1,12 +1,13 @@
-"""The surface of a field that is trained on the images alone: the geometry `neus` of R3F.
+"""The surface of a field that is trained on the images alone: `neus` and `nunerf` of R3F.
 
-    {out}/field/            a run: a NeuS field along straight rays
+    {out}/field/            a run: a field of that kind along straight rays
     {out}/masked/{name}/    a scene without masks, with silhouettes of that surface as its masks
 
-The colour of a NeuS field depends on the point of its surface and on the direction of view, so that
+The colour of these fields depends on the point of the surface and on the direction of view, so that
 it memorises what is seen through the glass; the surface goes where such a picture agrees in all
-views, which is the glass. That is the first stage of NU-NeRF. Its colour is split into a reflected
-and a transmitted part by Fresnel's equations, each with a network; here one network has both.
+views, which is the glass. That is the first stage of NU-NeRF, where Schlick's equation splits the
+colour into a reflected and a transmitted part, each with a network (`--geometry=nunerf`). With
+`--geometry=neus`, one network has both.
 
 Masks are not used. Later stages need some: to know which pixels show what is behind the object. A
 scene without masks is copied, with silhouettes of the surface in their place.
@@ -33,8 +34,8 @@ from refref_jax.render.images import find_first_surface
 from refref_jax.training.config import TrainConfig
 from refref_jax.training.resolve import Resolved, read_facts, resolve
 
-NAME = "neus"
-"""Name of this geometry."""
+NAMES = ("neus", "nunerf")
+"""Names of these geometries, which are those of their kinds of field."""
 
 RUN = "field"
 """Name of the run of the field."""
@@ -67,8 +68,8 @@ def check(scene: Path, config: ReconstructionConfig) -> None:
         _resolved(scene, config)
     except ValueError as error:
         raise ValueError(
-            f"--geometry={NAME} cannot be used here, since its field cannot be trained: {error} "
-            "Use --geometry=hull, with masks."
+            f"--geometry={config.geometry} cannot be used here, since its field cannot be trained: "
+            f"{error} Use --geometry=hull, with masks."
         ) from error
 
 
@@ -85,7 +86,7 @@ def masked_scene(scene: Path, out: Path, config: ReconstructionConfig) -> Path:
       ValueError: if the field has no surface, or cannot be trained on the scene.
       KeyboardInterrupt: if its training was stopped; it has been saved.
     """
-    if config.geometry != NAME or has_masks(scene):
+    if config.geometry not in NAMES or has_masks(scene):
         return scene
     copy = out / MASKED / scene.resolve().name
     if not copy.is_dir():
@@ -136,7 +137,7 @@ def _resolved(scene: Path, config: ReconstructionConfig) -> Resolved:
     asked = TrainConfig().override(
         scene=str(scene.resolve()),
         paths="straight",
-        field="neus",
+        field=config.geometry,
         preset=PRESET,
         background=config.space,
         radius=config.radius,

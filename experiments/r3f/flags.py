@@ -16,7 +16,7 @@ with epy.lazy_imports():
 flags.disclaim_key_flags()
 
 # Equal to those of `geometry_stage`, which imports JAX; a test compares them.
-GEOMETRIES = ("hull", "occupancy", "neus")
+GEOMETRIES = ("hull", "occupancy", "neus", "nunerf")
 
 
 class ReconstructionFlags(NamedTuple):
@@ -46,7 +46,8 @@ class ReconstructionFlags(NamedTuple):
 def reconstruction() -> ReconstructionFlags:
     """Defines the flags of a reconstruction."""
     how = "Method that finds the object: the exact visual hull of the masks, an occupancy field "
-    how += "trained on them, or the surface of a NeuS field of the images, which needs no masks."
+    how += "trained on them, or the surface of a field of the images, by NeuS or NU-NeRF, which "
+    how += "needs no masks."
     cells = "Cells along the longest edge of the grid around the object."
     wrong = "Number of masks that may be wrong, which reduces the accuracy of a hull everywhere."
     light = "What refines the surface and the index: the light refracted through it, or nothing. "
@@ -60,8 +61,8 @@ def reconstruction() -> ReconstructionFlags:
     flags.register_multi_flags_validator(
         ["geometry", "outliers"],
         lambda given: given["geometry"] == "hull" or not given["outliers"],
-        "--outliers has no effect on an occupancy field, which weighs all masks, or on NeuS, which "
-        "reads none. Remove either.",
+        "--outliers has no effect on an occupancy field, which weighs all masks, or on a field of "
+        "the images (neus, nunerf), which reads none. Remove either.",
     )
     return found
 

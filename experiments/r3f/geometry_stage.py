@@ -73,14 +73,14 @@ def _occupancy(inputs: Inputs, config: ReconstructionConfig) -> Grid:
         )
 
 
-def _neus(inputs: Inputs, config: ReconstructionConfig) -> Grid:
+def _field(inputs: Inputs, config: ReconstructionConfig) -> Grid:
     return field_surface.find(inputs.scene, inputs.out, config)
 
 
 GEOMETRIES: dict[str, Callable[[Inputs, ReconstructionConfig], Grid]] = {
     "hull": _hull,
     "occupancy": _occupancy,
-    field_surface.NAME: _neus,
+    **dict.fromkeys(field_surface.NAMES, _field),
 }
 """Methods by name, whose grid is negative inside the object."""
 

@@ -32,7 +32,8 @@ are ours.
 
 import dataclasses
 import math
-from typing import Literal, NamedTuple
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -163,13 +164,48 @@ class NeusParams(NamedTuple):
     index_change: Float[Array, ""] | None = None
 
 
-def init_radiance(key: Array, config: SurfaceConfig) -> NeusParams:
-    """Returns initial parameters: those of a ball."""
+class Visible(NamedTuple):
+    """What is known of a point whose colour is wanted.
+
+    Attributes:
+      features: features of the point, without activation.
+      position: the point in the ball, whose radius is 1.
+      normal: unit normal, outwards.
+      direction: unit direction of travel, towards the surface.
+    """
+
+    features: Float[Array, " features"]
+    position: Float[Array, "3"]
+    normal: Float[Array, "3"]
+    direction: Float[Array, "3"]
+
+
+Colour = Callable[[Visible, Any], Float[Array, "3"]]
+"""Function of a point and the shape of the field, in a module, that returns a colour in `[0, 1]`.
+"""
+
+
+def view_dependent(point: Visible, config: SurfaceConfig) -> Float[Array, "3"]:
+    """Returns the colour of a point by NeuS: a network of its features, normal and direction."""
+    seen = jnp.concatenate([point.features, point.normal])
+    return jax.nn.sigmoid(directional_network(seen, point.direction, config, outputs=3))
+
+
+def init_radiance(
+    key: Array, config: SurfaceConfig, *, colour: Colour = view_dependent
+) -> NeusParams:
+    """Returns initial parameters: those of a ball.
+
+    Args:
+      key: key of the random numbers.
+      config: shape of the field.
+      colour: network of the colour.
+    """
     surface_key, around_key = jax.random.split(key)
     nowhere = jnp.zeros(3, jnp.float32)
     learned = None if isinstance(config, UnisurfConfig) else jnp.log(jnp.float32(config.sharpness))
     return NeusParams(
-        _Surface(config).init(surface_key, nowhere, nowhere),
+        _Surface(config, colour).init(surface_key, nowhere, nowhere),
         zipnerf.init_radiance(around_key, around(config)),
         learned,
     )
@@ -180,6 +216,8 @@ def radiance(
     config: SurfaceConfig,
     gaussians: Gaussians,
     direction: Float[Array, "3"],
+    *,
+    colour: Colour = view_dependent,
 ) -> Surface:
     """Returns signed value, density and colour of one interval of a path.
 
@@ -188,13 +226,14 @@ def radiance(
       config: shape of the field, as in `init_radiance`.
       gaussians: multisamples in the unit cube, as fractions of its edge.
       direction: unit direction of travel at the interval, world frame.
+      colour: network of the colour, as in `init_radiance`.
     """
     middle = jnp.mean(gaussians.positions, axis=0)
     centre = jnp.asarray(config.ball_centre, middle.dtype)
     position = (middle - centre) / config.ball_radius
     within = numerics.length(position) < 1.0
     signed, steepest, curvature, rgb = evaluate(
-        _Surface(config), params.surface, jnp.clip(position, -1.0, 1.0), direction
+        _Surface(config, colour), params.surface, jnp.clip(position, -1.0, 1.0), direction
     )
     outer = zipnerf.radiance(params.around, around(config), gaussians, direction)
     behind = numerics.dot(position, direction) > 0.0
@@ -316,6 +355,7 @@ class _Surface(nn.Module):
     """Signed value, its slope and curvature, and colour, at a point of the unit ball."""
 
     config: SurfaceConfig
+    colour: Colour
 
     @nn.compact
     def __call__(
@@ -328,8 +368,8 @@ class _Surface(nn.Module):
         signed, hidden = _signed_values(position[None] + step * offsets, config)
         steepest = slope(signed[1:], step=step)
         features = layer(config.bottleneck)(hidden[0])
-        seen = jnp.concatenate([features, numerics.normalize(steepest)])
-        rgb = jax.nn.sigmoid(directional_network(seen, direction, config, outputs=3))
+        normal = numerics.normalize(steepest)
+        rgb = self.colour(Visible(features, position, normal, direction), config)
         return signed[0], steepest, laplacian(signed[0], signed[1:], step=step), rgb
 
 

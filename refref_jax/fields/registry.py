@@ -8,7 +8,7 @@ from collections.abc import Mapping
 
 from jaxtyping import Array, Float
 
-from refref_jax.fields import msnerf, nerfacto, neus, raydef, rosenerf, tnsr, zipnerf
+from refref_jax.fields import msnerf, nerfacto, neus, nunerf, raydef, rosenerf, tnsr, zipnerf
 from refref_jax.fields.base import (
     Blend,
     DensityConfig,
@@ -28,6 +28,7 @@ KINDS: dict[str, FieldKind] = {
     "msnerf": msnerf.KIND,
     "neus": neus.KIND,
     "unisurf": neus.UNISURF,
+    "nunerf": nunerf.KIND,
     "tnsr": tnsr.KIND,
     "raydef": raydef.KIND,
     "raydef_polyline": raydef.POLYLINE,

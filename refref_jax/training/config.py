@@ -151,9 +151,9 @@ class FieldConfig:
     Attributes:
       preset: Size of the model and length of its training.
       field: Field kind: zipnerf; nerfacto, without anti-aliasing; msnerf, with sub-spaces; neus or
-        unisurf, with the surface of an opaque object; tnsr, whose learned surface bends light;
-        raydef or raydef_polyline, with a deformation of straight rays; rosenerf, with a second
-        ray; or Gaussian splats.
+        unisurf, with the surface of an opaque object; nunerf, with that surface and colours of
+        glass; tnsr, whose learned surface bends light; raydef or raydef_polyline, with a
+        deformation of straight rays; rosenerf, with a second ray; or Gaussian splats.
       sub_spaces: Number of sub-spaces, only of field=msnerf.
       gaussians: Number of Gaussians, only of field=splats.
       splat_filter: Opacity of blurred Gaussians: reduced (mip) or kept (classic), of field=splats.

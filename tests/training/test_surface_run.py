@@ -118,7 +118,7 @@ def test_the_ball_is_between_the_cameras():
     assert place_surface(plain, elsewhere) is plain
 
 
-@pytest.mark.parametrize("field", ["neus", "unisurf"])
+@pytest.mark.parametrize("field", ["neus", "unisurf", "nunerf"])
 def test_cameras_that_look_elsewhere_are_refused(field):
     extent = bounds(CAMERAS, space="bounded", radius=7.3)
     model = PRESETS["tiny"].model(extent, "field", field=field)
@@ -149,7 +149,10 @@ def _config(**changes):
     return TrainConfig().override(scene=str(_SCENE), pretraced_batches=4, **small, **given)
 
 
-@pytest.fixture(scope="module", params=["neus", pytest.param("unisurf", marks=pytest.mark.slow)])
+_SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("unisurf", "nunerf")]
+
+
+@pytest.fixture(scope="module", params=["neus", *_SLOW])
 def trained(request, tmp_path_factory):
     """A model, and the folder of its run."""
     run = tmp_path_factory.mktemp(request.param) / "run"
@@ -237,7 +240,7 @@ def test_wrong_options_are_refused_before_anything_is_compiled(changes, message,
 
 
 def test_weights_of_the_losses_are_those_of_the_kind():
-    for field, eikonal in (("neus", 0.1), ("unisurf", 0.0)):
+    for field, eikonal in (("neus", 0.1), ("unisurf", 0.0), ("nunerf", 0.1)):
         resolved, _ = fit.prepare(_config(field=field), report=lambda line: None)
         assert (resolved.config.losses.eikonal, resolved.config.losses.curvature) == (eikonal, 0.0)
     given = _config(eikonal_weight=0.3, curvature_weight=1e-3)

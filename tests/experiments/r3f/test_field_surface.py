@@ -65,6 +65,13 @@ def test_the_surface_is_the_zero_set_of_the_field(bare, untrained, tmp_path):
     assert model.settings.max_bends == 0 and model.config.backdrop is None
 
 
+@pytest.mark.parametrize("geometry", field_surface.NAMES)
+def test_a_geometry_is_the_field_of_its_name_along_straight_rays(bare, geometry):
+    wanted = field_surface._resolved(bare, dataclasses.replace(_CONFIG, geometry=geometry))
+    assert wanted.model.config.field.kind == geometry
+    assert wanted.model.settings.max_bends == 0 and wanted.config.seed == _CONFIG.seed
+
+
 def test_the_largest_piece_is_the_object():
     x, y, z = np.meshgrid(*[np.linspace(-2.0, 2.0, 33)] * 3, indexing="ij")
     large = np.sqrt((x + 0.8) ** 2 + y**2 + z**2) - 0.9
@@ -99,7 +106,7 @@ def test_a_scene_without_masks_gets_silhouettes_of_the_surface(bare, untrained, 
     assert len(untrained) == trained  # the copy is not made again
 
 
-@pytest.mark.parametrize("geometry", ["neus", "hull"])
+@pytest.mark.parametrize("geometry", ["neus", "nunerf", "hull"])
 def test_masks_that_are_there_are_kept(scene, untrained, tmp_path, geometry):
     config = dataclasses.replace(_CONFIG, geometry=geometry)
     assert field_surface.masked_scene(scene, tmp_path, config) == scene and not untrained
