@@ -401,6 +401,9 @@ def _tell_masks(
 
 
 def _tell_left_out(capture: Capture, unlisted: int) -> None:
+    if capture.missing:
+        shown = ", ".join(capture.missing[:3]) + (", ..." if len(capture.missing) > 3 else "")
+        print(f"warning: {len(capture.missing)} photographs do not exist and are left out: {shown}")
     if unlisted:
         print(f"Skipped: {unlisted} frames that are not in the capture's lists.")
     if capture.has_depth:

@@ -1,6 +1,6 @@
 """A capture of any program: photographs with lenses, poses and masks, before it becomes a scene."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -62,6 +62,7 @@ class Capture(NamedTuple):
       applied_scale: scale that was applied after that.
       has_depth: whether frames name depth maps, which are not read.
       points: points of the capture, or `None` without any.
+      missing: names of photographs that the capture lists, but that do not exist.
     """
 
     frames: tuple[CaptureFrame, ...]
@@ -70,6 +71,27 @@ class Capture(NamedTuple):
     applied_scale: float
     has_depth: bool
     points: PointCloud | None = None
+    missing: tuple[str, ...] = ()
+
+
+def missing_photographs(photographs: Mapping[str, Path], path: Path) -> tuple[str, ...]:
+    """Returns the names of photographs that do not exist, as of blurred ones that were removed.
+
+    Args:
+      photographs: file of each name.
+      path: file that names them, for messages.
+
+    Raises:
+      SceneError: if half of them are missing, as in a wrong folder.
+    """
+    missing = tuple(name for name, file in photographs.items() if not file.is_file())
+    if 2 * len(missing) >= max(1, len(photographs)):
+        raise SceneError(
+            f"{photographs[missing[0]]} does not exist, but {path} names it, and "
+            f"{len(missing)} of its {len(photographs)} photographs are missing. Copy them there; "
+            "for a model of COLMAP, give their folder (--images of import_capture)."
+        )
+    return missing
 
 
 def every_nth(frames: int, *, every: int) -> dict[str, tuple[int, ...]]:

@@ -20,7 +20,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from experiments.captures.capture import Capture, CaptureFrame, PointCloud
+from experiments.captures.capture import (
+    Capture,
+    CaptureFrame,
+    PointCloud,
+    missing_photographs,
+)
 from experiments.captures.lenses import Distortion, Intrinsics, Lens
 from refref_jax.data import FARTHEST, SceneError, file_inside, image_files
 
@@ -102,9 +107,15 @@ def read_capture(model: Path, images: Path) -> Capture:
     records = sorted(read[1](paths[1]), key=lambda image: image.name)
     if not records:
         raise SceneError(f"{paths[1]} has no images. Run COLMAP's mapper again.")
-    frames = tuple(_frame(record, lenses, images, paths[1]) for record in records)
+    photographs = {record.name: _photograph(record, images, paths[1]) for record in records}
+    missing = missing_photographs(photographs, paths[1])
+    frames = tuple(
+        _frame(record, lenses, photographs[record.name], paths[1])
+        for record in records
+        if record.name not in missing
+    )
     points = read[2](paths[2]) if paths[2].is_file() else None
-    return Capture(frames, None, np.eye(4)[:3], 1.0, has_depth=False, points=points)
+    return Capture(frames, None, np.eye(4)[:3], 1.0, False, points, missing)
 
 
 def lens_of(model: str, size: tuple[int, int], parameters: list[float], path: Path) -> Lens:
@@ -160,7 +171,11 @@ def pose_of(rotation: tuple[float, ...], translation: tuple[float, ...]) -> np.n
     return np.concatenate([to_camera.T * _FLIP, position[:, None]], axis=-1)
 
 
-def _frame(record: _Image, lenses: dict[int, Lens], images: Path, path: Path) -> CaptureFrame:
+def _photograph(record: _Image, images: Path, path: Path) -> Path:
+    return file_inside([images], record.name, where="the name of an image", path=path)
+
+
+def _frame(record: _Image, lenses: dict[int, Lens], image: Path, path: Path) -> CaptureFrame:
     if record.camera not in lenses:
         raise SceneError(
             f"{path}: {record.name} has the camera {record.camera}, which the file of cameras "
@@ -172,12 +187,6 @@ def _frame(record: _Image, lenses: dict[int, Lens], images: Path, path: Path) ->
         raise SceneError(
             f"{path}: the pose of {record.name} is {numbers.tolist()}, whose first four numbers "
             "are no unit quaternion. Export the model again."
-        )
-    image = file_inside([images], record.name, where="the name of an image", path=path)
-    if not image.is_file():
-        raise SceneError(
-            f"{image} does not exist, but {path} names it. Give the folder of the images "
-            "(--images of import_capture)."
         )
     lens, (height, width) = lenses[record.camera], image_files.read_size(image)
     if (width, height) != lens.intrinsics[4:]:

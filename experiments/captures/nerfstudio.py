@@ -31,6 +31,7 @@ from experiments.captures.capture import (
     CaptureFrame,
     PointCloud,
     check_sizes,
+    missing_photographs,
     read_points,
 )
 from experiments.captures.lenses import Distortion, Intrinsics
@@ -67,20 +68,16 @@ def read_frame(content: dict[str, Any], record: Any, path: Path) -> CaptureFrame
       SceneError: if a file is missing, the pose is not a rigid motion, or the camera's model is
         not known.
     """
-    name = scene_folder.get_text(record, "file_path", path)
-    # Instant NGP omits the extension.
-    named = name if Path(name).suffix else f"{name}.png"
-    image = file_inside([path.parent], named, where="file_path", path=path)
+    name, image = _photograph(record, path)
     matrix = scene_folder.get(record, "transform_matrix", path)
     mask = None
     if "mask_path" in record:
         mask = file_inside([path.parent], record["mask_path"], where="mask_path", path=path)
     distortion = _distortion(content, record, name, path)
-    for file in (image, mask):
-        if file is not None and not file.is_file():
-            raise SceneError(
-                f"{file} does not exist, but {path} names it. Copy it there, or remove the frame."
-            )
+    if mask is not None and not mask.is_file():
+        raise SceneError(
+            f"{mask} does not exist, but {path} names it. Copy it there, or remove the frame."
+        )
     return CaptureFrame(
         name=name,
         image=image,
@@ -89,6 +86,14 @@ def read_frame(content: dict[str, Any], record: Any, path: Path) -> CaptureFrame
         intrinsics=_intrinsics(content, record, image, path),
         distortion=distortion,
     )
+
+
+def _photograph(record: Any, path: Path) -> tuple[str, Path]:
+    """Returns the name of a frame's photograph, and its file."""
+    name = scene_folder.get_text(record, "file_path", path)
+    # Instant NGP omits the extension.
+    named = name if Path(name).suffix else f"{name}.png"
+    return name, file_inside([path.parent], named, where="file_path", path=path)
 
 
 def read_number(records: Sequence[dict[str, Any]], name: str, path: Path) -> float | None:
@@ -201,23 +206,27 @@ def read_capture(source: Path) -> Capture:
     records = scene_folder.get(content, "frames", path)
     if not isinstance(records, list) or not records:
         raise SceneError(f"{path} lists no frames. Process the images again.")
-    frames = sorted(
-        (read_frame(content, record, path) for record in records), key=lambda frame: frame.name
-    )
-    counted = collections.Counter(Path(frame.name) for frame in frames)
+    named = [(*_photograph(record, path), record) for record in records]
+    counted = collections.Counter(Path(name) for name, _, _ in named)
     if repeated := [name for name, count in counted.items() if count > 1]:
         raise SceneError(f"{path} lists {repeated[0]} twice. Remove one of the frames.")
+    missing = missing_photographs({name: image for name, image, _ in named}, path)
+    there = [record for name, _, record in named if name not in missing]
+    frames = sorted(
+        (read_frame(content, record, path) for record in there), key=lambda frame: frame.name
+    )
     check_sizes(frames)
     scale = read_number([content], "applied_scale", path)
     if scale is not None and not scale > 0.0:
         raise SceneError(f"applied_scale is {scale:g} in {path}. Give a positive number.")
     return Capture(
         frames=tuple(frames),
-        splits=_splits(content, [frame.name for frame in frames], path),
+        splits=_splits(content, [frame.name for frame in frames], missing, path),
         applied=_applied_transform(content, path),
         applied_scale=1.0 if scale is None else scale,
         has_depth=any("depth_file_path" in record for record in records),
         points=_points(content, path),
+        missing=missing,
     )
 
 
@@ -292,22 +301,31 @@ def _applied_transform(content: dict[str, Any], path: Path) -> Float[np.ndarray,
 
 
 def _splits(
-    content: dict[str, Any], names: Sequence[str], path: Path
+    content: dict[str, Any], names: Sequence[str], missing: Sequence[str], path: Path
 ) -> dict[str, tuple[int, ...]] | None:
-    """Returns the splits that a file lists, without repetitions of another split."""
+    """Returns the splits that a file lists, without repetitions of another split.
+
+    Args:
+      content: content of the file.
+      names: names of the frames.
+      missing: names of those that are left out.
+      path: path of the file.
+    """
     numbers = {Path(name): number for number, name in enumerate(names)}
+    unseen = {Path(name) for name in missing}
     found: dict[str, tuple[int, ...]] = {}
     for split in ("train", "test", "val"):
         listed = content.get(f"{split}_filenames") or []
         if not isinstance(listed, list):
             raise SceneError(f"{split}_filenames is {listed!r} in {path}. Give a list of names.")
         for name in listed:
-            if not isinstance(name, str) or Path(name) not in numbers:
+            if not isinstance(name, str) or Path(name) not in numbers.keys() | unseen:
                 raise SceneError(
                     f"{split}_filenames of {path} lists {name!r}, which is not the file_path of a "
                     "frame. Add the frame, or remove the name."
                 )
-        frames = tuple(sorted(numbers[Path(name)] for name in listed))
+        seen = (Path(name) for name in listed if Path(name) not in unseen)
+        frames = tuple(sorted(numbers[name] for name in seen))
         if frames and frames not in found.values():
             found[split] = frames
     if found and "train" not in found:

@@ -129,7 +129,6 @@ def test_cameras_that_are_not_read(tmp_path, photos, poses, form, camera, messag
     ("image", "message"),
     [
         ({"camera": 7}, r"a\.png has the camera 7, which the file of cameras lacks"),
-        ({"name": "none.png"}, r"none\.png does not exist.*--images"),
         ({"name": "../a.png"}, r"the name of an image is '\.\./a\.png', which is outside"),
         ({"pose": np.full((3, 4), np.nan)}, "no unit quaternion"),
         ({"pose": np.eye(3, 4, 0) + 1e7 * np.eye(3, 4, 3)}, "Coordinates are at most 1e"),
@@ -145,6 +144,18 @@ def test_images_that_are_not_read(tmp_path, photos, poses, form, image, message,
         images[1] = images[1]._replace(pose=poses[0])
     with pytest.raises(SceneError, match=message):
         colmap.read_capture(_write(tmp_path / "m", form, poses, images=images), photos)
+
+
+@pytest.mark.parametrize("form", _WRITERS)
+def test_missing_photographs_are_left_out_unless_half_of_them_are(tmp_path, photos, poses, form):
+    model = _write(tmp_path / "m", form, poses)
+    names = [frame.name for frame in colmap.read_capture(model, photos).frames]
+    (photos / names[0]).unlink()
+    read = colmap.read_capture(model, photos)
+    assert read.missing == (names[0],) and [frame.name for frame in read.frames] == names[1:]
+    (photos / names[1]).unlink()
+    with pytest.raises(SceneError, match=r"does not exist.* 2 of its 3 photographs.*--images"):
+        colmap.read_capture(model, photos)
 
 
 def test_binary_files_that_end_early(tmp_path, photos, poses):

@@ -82,7 +82,6 @@ def _distorted(key, value, frame=None):
         (_distorted("cx", math.inf), "cx is inf in .*Give a finite number"),
         (_distorted("w", 24), r"is 12 x 10 pixels, but .* says 24 x 10"),
         (_distorted("fl_x", 8.0, 1), r"fl_x is 9.0 for all frames of .* and 8.0 in one"),
-        (_distorted("file_path", "images/none.png", 1), "none.png does not exist"),
         (_distorted("mask_path", "masks/none.png", 1), "none.png does not exist"),
         (_distorted("file_path", 3, 1), "file_path is 3"),
         (_distorted("transform_matrix", [[1.0]], 1), "frame_00001.*not a finite 4 x 4 matrix"),
@@ -99,6 +98,24 @@ def _distorted(key, value, frame=None):
 def test_what_can_not_be_used_is_named(capture, change, message):
     edit(capture, change)
     with pytest.raises(SceneError, match=message):
+        nerfstudio.read_capture(capture)
+
+
+def test_missing_photographs_are_left_out_unless_half_of_them_are(capture):
+    lists = {
+        "train_filenames": [f"images/frame_0000{number}.png" for number in range(7)],
+        "test_filenames": ["images/frame_00007.png", "images/frame_00008.png"],
+    }
+    edit(capture, lambda content: content.update(lists))
+    for number in (1, 5, 8):
+        (capture / "images" / f"frame_0000{number}.png").unlink()
+    read = nerfstudio.read_capture(capture)
+    assert read.missing == tuple(f"images/frame_0000{number}.png" for number in (1, 5, 8))
+    assert [frame.name[-5] for frame in read.frames] == list("023467")
+    assert read.splits == {"train": (0, 1, 2, 3, 4), "test": (5,)}
+    for number in (2, 3):
+        (capture / "images" / f"frame_0000{number}.png").unlink()
+    with pytest.raises(SceneError, match=r"frame_00001\.png does not exist.* 5 of its 9 phot"):
         nerfstudio.read_capture(capture)
 
 
