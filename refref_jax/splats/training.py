@@ -369,10 +369,8 @@ def relocate(
     count = gaussians.logits.size
     opacity = jax.nn.sigmoid(gaussians.logits)
     dead = (opacity <= _TRANSPARENT) & jnp.any(opacity > _TRANSPARENT)
-    chances = jnp.where(opacity > _TRANSPARENT, jnp.log(opacity), -jnp.inf)
-    chances = jnp.where(jnp.any(dead), chances, 0.0)
-    drawn = jax.random.categorical(key, chances, shape=(count,)).astype(jnp.int32)
     own = jnp.arange(count, dtype=jnp.int32)
+    drawn = _draw(key, jnp.where(dead, 0.0, opacity))
     source = jnp.where(dead, drawn, own)
     arrivals = jnp.zeros(count, jnp.int32).at[drawn].add(dead.astype(jnp.int32))
     sharing = jnp.clip(arrivals[source] + 1, 1, _MOST_SHARING)
@@ -396,6 +394,20 @@ def relocate(
         }
     )
     return gaussians, moments, jnp.sum(dead, dtype=jnp.int32)
+
+
+def _draw(key: Array, chances: Float[Array, " n"]) -> Int[Array, " n"]:
+    """Returns as many indices as there are chances, drawn in proportion to them.
+
+    None has the chance 0, unless all have. `jax.random.categorical` would hold a number for each
+    pair of Gaussians. In single precision, a cumulative sum may fall from one entry to the next,
+    so that `jax.random.choice` returns some of chance 0, if there are many.
+    """
+    possible_first = jnp.argsort(chances <= 0.0).astype(jnp.int32)
+    cumulative = jnp.cumsum(chances[possible_first])
+    draws = cumulative[-1] * (1.0 - jax.random.uniform(key, chances.shape))
+    last = jnp.maximum(jnp.sum(chances > 0.0) - 1, 0)
+    return possible_first[jnp.minimum(jnp.searchsorted(cumulative, draws), last)]
 
 
 def shared(

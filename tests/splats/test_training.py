@@ -111,6 +111,26 @@ def test_sharing_preserves_the_opacity_along_a_line(count, opacity):
     assert many.sum() == pytest.approx(one.sum(), rel=1e-2)
 
 
+def test_draws_have_their_chances_and_none_is_impossible():
+    count = 300_000
+    chances = jnp.where(jnp.arange(count) % 3 == 0, 0.0, jnp.linspace(0.1, 1.0, count))
+    drawn = np.asarray(jax.jit(training._draw)(jax.random.key(2), chances))
+    assert drawn.shape == (count,) and np.all(drawn % 3 > 0)
+    # Tenths of the indices; four standard deviations of the least of them are 2.4 %.
+    found = np.bincount(drawn * 10 // count, minlength=10) / count
+    share = np.asarray(chances, np.float64).reshape(10, -1).sum(1) / float(chances.sum())
+    np.testing.assert_allclose(found, share, rtol=0.025)
+    for impossible in (jnp.zeros(5), jnp.zeros(5).at[3].set(1e-30)):
+        few = np.asarray(training._draw(jax.random.key(0), impossible))
+        assert np.all((few >= 0) & (few < 5)) and (impossible.sum() == 0 or np.all(few == 3))
+
+
+def test_relocations_hold_no_number_for_each_pair():
+    _, values, moments = jax.eval_shape(lambda: _begun(20_000))
+    compiled = jax.jit(training.relocate).lower(jax.random.key(0), values, moments).compile()
+    assert compiled.memory_analysis().temp_size_in_bytes < 2**27
+
+
 def test_a_relocation_resets_the_moments_of_those_that_share_a_place():
     values = made_splats.gaussians(50)
     logits = values.logits.at[:10].set(-8.0).at[10:].set(jnp.linspace(-2.0, 3.0, 40))
