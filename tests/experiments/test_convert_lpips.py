@@ -16,7 +16,7 @@ from tests.processes.command import run_command
 pytestmark = pytest.mark.loose
 
 # The options of a command that is imported must not meet those of another.
-for _flag in flags.FLAGS.flags_by_module_dict()[convert_lpips.__name__]:
+for _flag in list(flags.FLAGS.flags_by_module_dict()[convert_lpips.__name__]):
     delattr(flags.FLAGS, _flag.name)
 
 

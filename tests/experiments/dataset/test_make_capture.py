@@ -8,6 +8,7 @@ import json
 import imageio.v3 as iio
 import numpy as np
 import pytest
+from absl import flags
 
 from benchmarks import cameras as benchmark
 from experiments.captures import nerfstudio
@@ -15,6 +16,10 @@ from experiments.dataset import captures, frame_files, handheld
 from refref_jax.data import image_files, scene_folder
 from refref_jax.geometry.cameras import box_filter, image_rays
 from tests.processes.command import ROOT, run_command
+
+# The options of a command that is imported must not meet those of another.
+for _flag in list(flags.FLAGS.flags_by_module_dict()[benchmark.__name__]):
+    delattr(flags.FLAGS, _flag.name)
 
 _PYTHON = ROOT / ".venv-dataset" / "bin" / "python"
 
