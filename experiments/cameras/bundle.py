@@ -153,7 +153,7 @@ def solve(views: Views, points: np.ndarray, seen: Sightings, prior: Prior) -> So
       views: views with the given poses.
       points: first guess of the points, `[points, 3]`.
       seen: sightings; each point has two at least.
-      prior: how wrong given poses are.
+      prior: expected errors of given poses.
     """
     given = views.poses
     weights_of_prior = np.repeat([prior.rotation**-2.0, prior.shift**-2.0], 3)

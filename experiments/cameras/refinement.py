@@ -81,7 +81,7 @@ def refine(
     Args:
       views: views with the given poses.
       photos: their images.
-      prior: how wrong given poses are.
+      prior: expected errors of given poses.
       report: function that receives progress and warnings, as lines of text.
 
     Raises:

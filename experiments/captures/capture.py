@@ -194,7 +194,7 @@ def read_mask(path: Path, *, white: str) -> Bool[np.ndarray, "h w"]:
 
     Args:
       path: path of the mask.
-      white: what is white, `object` or `background`.
+      white: meaning of white, `object` or `background`.
     """
     if path.suffix.lower() in (".jpg", ".jpeg"):
         marked = image_files.read_rgb(path).max(axis=-1) >= _WHITE

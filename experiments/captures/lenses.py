@@ -143,7 +143,7 @@ class Extent(NamedTuple):
 
     Attributes:
       factor: largest factor.
-      end: what is there: the border of the image, a fold of the lens, or the largest factor asked.
+      end: end that is met: border of the image, fold of the lens, or largest factor asked.
     """
 
     factor: float

@@ -44,7 +44,7 @@ class Layout(NamedTuple):
 
     Attributes:
       photographs: frames of the capture.
-      frames: how each lies in the camera.
+      frames: place of each photograph in the camera.
       pinhole: the camera.
       crop: windows of the photographs, if they are cropped only.
       exact: whether pixels are kept as they are.
@@ -210,7 +210,7 @@ def write_scene(
       layouts: layout of each split.
       poses: poses of their images, in the world of the scene.
       out: folder of the scene; must not exist.
-      content: what else it holds.
+      content: other content of the scene.
       sense: meaning of white in the masks: `object` or `background`; `none` drops the masks.
       step: function called after every image.
 

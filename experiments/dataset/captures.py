@@ -155,7 +155,7 @@ def produce(
 
     Args:
       out: folder of the three folders; created if missing.
-      settings: what is made.
+      settings: settings of the capture.
       blender: Python that has bpy.
       workers: number of Blender processes, or one for each core.
       stopped: callback that returns whether the user wants to end; queried after every view.

@@ -71,7 +71,7 @@ class Surface(NamedTuple):
     Attributes:
       name: unique name, also of its files.
       corner, along, up: its lower left corner and its two sides, world units.
-      look: what covers it.
+      look: image or colour that covers it.
       radiance: linear RGB light that it emits, instead of reflecting any.
       near: whether cameras come close to it.
     """
@@ -190,8 +190,8 @@ def _box(
         `bottom`.
       low: its least corner.
       high: its greatest corner.
-      look: what covers it.
-      others: what covers single sides.
+      look: image or colour that covers it.
+      others: looks of single sides.
     """
     (x, y, z), (w, d, h) = low, np.subtract(high, low)
     sides = {

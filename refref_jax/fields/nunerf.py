@@ -103,7 +103,7 @@ def combine(
     """Returns the colour of a point of the surface, linear, in the range of the given colours.
 
     Args:
-      material: what the surface is made of.
+      material: material of the surface.
       mirrored: light from the mirrored direction, linear.
       refracted: light from behind the surface, linear.
       cosine: cosine of the angle between the outward normal and the direction to the camera.
