@@ -44,7 +44,7 @@ class Result(NamedTuple):
 
     Attributes:
       name: heading of the part.
-      seconds: how long it took.
+      seconds: duration.
       rows: its lines.
     """
 

@@ -60,8 +60,8 @@ class Prior(NamedTuple):
     """Standard deviations of the errors of given poses, per axis.
 
     Attributes:
-      rotation: of rotations, radians.
-      shift: of positions, world units.
+      rotation: standard deviation of rotations, radians.
+      shift: standard deviation of positions, world units.
     """
 
     rotation: float

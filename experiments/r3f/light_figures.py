@@ -48,7 +48,7 @@ def draw(
         has not determined them.
       ends: function of rays that returns the linear RGB of the opaque part that each meets first,
         NaN without any.
-      names: what both surfaces are called.
+      names: names of both surfaces.
     """
     frames, masks = scene_folder.read_object_views(scene_folder.read_frames(scene, split))
     count = len(frames.names)

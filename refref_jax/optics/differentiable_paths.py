@@ -84,7 +84,7 @@ class _Walk(NamedTuple):
       traced: whether the ray is to be cast; false for the paper's first reflection, and if max
         bends is 0.
       status: `EMPTY` while the path continues.
-      stop: where the path ends on an opaque surface; `None` without such surfaces.
+      stop: place where the path ends on an opaque surface; `None` without such surfaces.
     """
 
     state: RayState

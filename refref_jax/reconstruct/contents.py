@@ -42,7 +42,7 @@ class Interior:
     """What is inside a vessel, and of what it is made.
 
     Attributes:
-      contents: what is inside.
+      contents: kind of the contents.
       mouth: whether the vessel is open.
       wall: distance of the inner from the outer wall at rest, world units.
       base: least height of the inside above the lowest point of the axis, at rest, world units.

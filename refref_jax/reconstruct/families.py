@@ -187,7 +187,7 @@ class Revolution:
       points: profile of the fit, relative to the point of the axis.
       directions: its outward normals.
       closed: whether the profile is closed.
-      relief: how the surface differs from one of revolution, if it does.
+      relief: difference of the surface from one of revolution, if there is any.
     """
 
     name = "surface of revolution"
@@ -434,7 +434,7 @@ def fit_revolution(
     Args:
       mesh: closed mesh, in one piece.
       furthest: largest rms distance of the mesh from the body, as a share of its diameter.
-      smooth: what `revolution.fit_axis_and_profile` found, if it is known.
+      smooth: result of `revolution.fit_axis_and_profile`, if it is known.
 
     Returns:
       The body, or `None` if the mesh is further from it.

@@ -71,8 +71,8 @@ class FreeVessel(Vessel):
     and liquid, the logarithms of the tints, and the absorption of the liquid.
 
     Attributes:
-      interior_at_start: what is inside at the start; heights are along the z axis.
-      layout: where the unknowns are; there is no axis.
+      interior_at_start: contents at the start; heights are along the z axis.
+      layout: places of the unknowns; there is no axis.
       size: diameter, world units.
     """
 

@@ -168,7 +168,7 @@ class Fit(NamedTuple):
     Attributes:
       x: unknowns.
       covariance: their covariance: that of the prior where light says nothing.
-      steps: what the steps did.
+      steps: records of the steps.
     """
 
     x: Float[np.ndarray, " unknowns"]

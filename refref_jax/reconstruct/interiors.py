@@ -131,8 +131,8 @@ class Vessel:
       >>> vessel.interior(fit.x).level
 
     Attributes:
-      interior_at_start: what is inside at the start.
-      layout: where the unknowns are.
+      interior_at_start: contents at the start.
+      layout: places of the unknowns.
       size: diameter, world units.
     """
 

@@ -36,7 +36,7 @@ class Stretched(NamedTuple):
     """Points after they were stretched.
 
     Attributes:
-      points: in the frame of the axis, world units.
+      points: points in the frame of the axis, world units.
       jacobian: their derivatives by the points before.
     """
 

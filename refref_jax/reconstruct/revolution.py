@@ -236,7 +236,7 @@ class Section(NamedTuple):
     """Which share of each circle around the axis is inside a mesh.
 
     Attributes:
-      shares: at the centres of cells, by height and radius.
+      shares: shares at the centres of cells, by height and radius.
       bottom: height of the lower side of the first row.
       cell: side of a cell; the first column begins on the axis.
     """

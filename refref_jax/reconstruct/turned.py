@@ -235,7 +235,7 @@ class StraightTurned:
         """Returns points and normals of the profile, and derivatives by its own unknowns.
 
         Args:
-          unknowns: as those of `pose`.
+          unknowns: unknowns, as those of `pose`.
           along_line: steps of each straight piece.
           along_arc: steps of each arc.
         """

@@ -99,7 +99,7 @@ def fit_turned(
     Args:
       mesh: closed mesh, in one piece.
       furthest: largest rms distance of the mesh from the body, as a share of its diameter.
-      smooth: what `revolution.fit_axis_and_profile` found, if it is known.
+      smooth: result of `revolution.fit_axis_and_profile`, if it is known.
 
     Returns:
       The body, or `None` if the mesh is further from it, or clearly further than from the smooth
@@ -355,7 +355,7 @@ class Corners(NamedTuple):
     """Corners of a profile before rounding.
 
     Attributes:
-      points: where its straight pieces meet; an open profile begins and ends on the axis.
+      points: points where its straight pieces meet; an open profile begins and ends on the axis.
       fillets: radii of the corners that are not on the axis.
     """
 

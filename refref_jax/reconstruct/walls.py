@@ -253,7 +253,7 @@ def between(
     Args:
       wall: the wall.
       moved: the same at some offsets.
-      shares: where the points are, from 0 to 1.
+      shares: places of the points, from 0 to 1.
       begin: first length.
       end: last length.
     """

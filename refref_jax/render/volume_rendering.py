@@ -277,7 +277,7 @@ def integrate(
     Args:
       params: parameters of the model.
       config: configuration of the model.
-      seen: what the field returned for each interval.
+      seen: result of the field for each interval.
       edges: distances of the edges of the intervals.
       weigh: function of the densities of all intervals that returns their weights.
 
