@@ -91,9 +91,10 @@ def test_axis_aligned_rays_against_a_box_are_exact(kind):
 
 def test_a_ray_in_the_plane_of_a_triangle_misses():
     triangle = np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0]]], float)
-    distances, faces, _ = _closest(triangle, [[-1.0, 0.2, 0.0]], [[1.0, 0.0, 0.0]])
-    assert distances[0] == np.inf
-    assert faces[0] == -1
+    origins = np.stack([np.full(200, -1.0), np.linspace(-0.1, 1.1, 200), np.zeros(200)], axis=-1)
+    distances, faces, _ = _closest(triangle, origins, np.tile([1.0, 0.0, 0.0], (200, 1)))
+    assert np.all(distances == np.inf)
+    assert np.all(faces == -1)
 
 
 @pytest.mark.parametrize("target", ["vertices", "edges", "faces"])
@@ -105,6 +106,7 @@ def test_no_ray_slips_through_a_closed_surface(target, subdivisions):
         "edges": mesh.vertices[mesh.edges_unique].mean(axis=1),
         "faces": mesh.triangles_center,
     }[target]
+    points = np.resize(points, (1920, 3))  # as many as the edges of the finer one
     generator = np.random.default_rng(0)
     origins = generator.uniform(-0.2, 0.2, points.shape)
     directions = arrays.unit(points - origins)
@@ -152,8 +154,8 @@ def test_spare_rows_change_no_hit(faces):
         assert round_number == plain + bvh_build.spare_rows(plain)
         assert bvh_build.spare_rows(round_number) == 0
     np.testing.assert_array_equal(filled.triangles[: len(slots)], tree.triangles)
-    origins, directions = _random_rays(500)
-    nothing = np.full(500, np.inf, np.float32), np.full(500, bvh.NO_PRIMITIVE, np.int32)
+    origins, directions = _random_rays(200)
+    nothing = np.full(200, np.inf, np.float32), np.full(200, bvh.NO_PRIMITIVE, np.int32)
     rays = [x.astype(np.float32) for x in (origins, directions)]
     for lockstep in (False, True):
         plain, spare = (_trace(each, *rays, *nothing, lockstep=lockstep) for each in (tree, filled))
@@ -184,13 +186,13 @@ def test_meshes_of_similar_size_have_trees_of_the_same_shape():
 
 
 def test_an_empty_scene_is_missed():
-    distances, faces, _ = _closest(np.zeros((0, 3, 3)), *_random_rays(20))
+    distances, faces, _ = _closest(np.zeros((0, 3, 3)), *_random_rays(200))
     assert np.all(distances == np.inf)
     assert np.all(faces == -1)
 
 
 def test_degenerate_and_duplicate_triangles_do_no_harm():
-    triangles = _soup(30)
+    triangles = _soup(40)
     point = np.repeat(triangles[:5, :1], 3, axis=1)
     line = triangles[5:10].copy()
     line[:, 2] = 0.5 * (line[:, 0] + line[:, 1])
@@ -226,10 +228,13 @@ def test_a_ray_does_not_hit_the_triangle_it_leaves():
     _, slots = bvh_build.build(triangles.astype(np.float32))
     first = int(np.flatnonzero(slots[:2] == 0)[0])
     distances, faces, _ = _closest(
-        triangles, [[-1e-7, 0.0, 0.0]], [[1.0, 0.0, 0.0]], exclude_primitive=[first]
+        triangles,
+        np.tile([-1e-7, 0.0, 0.0], (200, 1)),
+        np.tile([1.0, 0.0, 0.0], (200, 1)),
+        exclude_primitive=np.full(200, first),
     )
-    assert faces[0] == 1
-    assert distances[0] == pytest.approx(1.0, abs=1e-6)
+    assert np.all(faces == 1)
+    np.testing.assert_allclose(distances, 1.0, atol=1e-6)
 
 
 def test_barycentrics_give_back_the_hit_point():
