@@ -24,11 +24,23 @@ def _rays(count, *, radius=1e-2, seed=0):
     return Rays(*(jnp.asarray(x, jnp.float32) for x in (0.3 * drawn[0], directions, radii)))
 
 
+@functools.partial(jax.jit, static_argnames=("domain", "most_taps", "axes"))
 def _lookups(domain, rays, *, most_taps=3, axes=0):
     ends = straight_ends(rays, footprint="differential")
     pixels = jnp.arange(rays.radii.size, dtype=jnp.int32) // 2
     shape = {"resolution": _SIDE, "most_taps": most_taps, "axes": axes}
     return backdrop.locate(domain, ends, pixels, **shape)
+
+
+_colours = jax.jit(backdrop.colours, static_argnames="pixels")
+_mipmap = jax.jit(backdrop.mipmap, static_argnums=1)
+_transposed = jax.jit(backdrop.transposed, static_argnames="resolution")
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _run(function, count, *arguments):
+    """Returns what a function of `backdrop` does, in one program."""
+    return function(count, *arguments)
 
 
 def _random_pyramid(seed=1):
@@ -43,20 +55,20 @@ def _random_pyramid(seed=1):
 def test_the_radiance_may_be_linear_in_the_direction(count):
     domain, rays = _DOMAINS["spherical"], _rays(count)
     lookups, plain = _lookups(domain, rays, axes=3), _lookups(domain, rays)
-    each = [backdrop.mipmap(_random_pyramid(seed), "spherical") for seed in range(4)]
+    each = [_mipmap(_random_pyramid(seed), "spherical") for seed in range(4)]
     mips = tuple(jnp.concatenate(level, axis=-1) for level in zip(*each, strict=True))
-    seen = jax.jit(lambda mips: backdrop.colours(mips, lookups, pixels=count // 2))(mips)
-    shares = [jnp.ones((count, 1)), *jnp.split(rays.directions, 3, axis=1)]
+    seen = _colours(mips, lookups, pixels=count // 2)
+    shares = [np.ones((count, 1), np.float32), *np.split(np.asarray(rays.directions), 3, axis=1)]
     expected = sum(
-        backdrop.colours(
-            mip, plain._replace(throughput=share * plain.throughput), pixels=count // 2
+        np.asarray(
+            _colours(mip, plain._replace(throughput=share * plain.throughput), pixels=count // 2)
         )
         for mip, share in zip(each, shares, strict=True)
     )
     np.testing.assert_allclose(seen, expected, atol=1e-5)
     # The transpose is that of the same function.
     slopes = jnp.asarray(np.random.default_rng(7).normal(size=(count // 2, 3)), jnp.float32)
-    spread = jax.jit(lambda x: backdrop.transposed(x, lookups, resolution=_SIDE))(slopes)
+    spread = _transposed(slopes, lookups, resolution=_SIDE)
     assert spread[0].shape[-1] == 12
     pairs = zip(spread, mips, strict=True)
     np.testing.assert_allclose(
@@ -84,29 +96,29 @@ def test_levels_are_halved_while_their_number_of_cells_is_even():
 @pytest.mark.parametrize("space", _SPACES)
 def test_a_uniform_surface_is_the_throughput_of_each_pixel(space):
     rays = _rays(200, radius=0.3)
-    mips = backdrop.mipmap(backdrop.init(_SIDE, radiance=jnp.array([0.2, 0.5, 4.0])), space)
+    mips = _mipmap(backdrop.init(_SIDE, radiance=jnp.array([0.2, 0.5, 4.0])), space)
     for copy in mips:
         np.testing.assert_allclose(copy, np.broadcast_to([0.2, 0.5, 4.0], copy.shape), rtol=1e-6)
     lookups = _lookups(_DOMAINS[space], rays)
     assert np.any(lookups.sides < _SIDE) and np.all(lookups.taps >= 1)
-    seen = backdrop.colours(mips, lookups, pixels=100)
+    seen = _colours(mips, lookups, pixels=100)
     np.testing.assert_allclose(seen, np.broadcast_to([0.4, 1.0, 8.0], (100, 3)), rtol=1e-5)
 
 
 @pytest.mark.parametrize("space", _SPACES)
 def test_native_loops_are_the_formulas_of_other_devices(space):
     lookups = _lookups(_DOMAINS[space], _rays(300, radius=0.1))
-    mips = backdrop.mipmap(_random_pyramid(), space)
+    mips = _mipmap(_random_pyramid(), space)
     table = backdrop._table(mips)
     np.testing.assert_allclose(
-        jax.jit(functools.partial(backdrop._read_native, 150))(table, lookups),
-        backdrop._read(150, table, lookups),
+        _run(backdrop._read_native, 150, table, lookups),
+        _run(backdrop._read, 150, table, lookups),
         rtol=1e-5,
     )
     slopes = jnp.asarray(np.random.default_rng(2).normal(size=(150, 3)), jnp.float32)
     np.testing.assert_allclose(
-        jax.jit(functools.partial(backdrop._add_native, len(table)))(slopes, lookups),
-        backdrop._add(len(table), slopes, lookups),
+        _run(backdrop._add_native, len(table), slopes, lookups),
+        _run(backdrop._add, len(table), slopes, lookups),
         atol=1e-5,
     )
 
@@ -116,9 +128,9 @@ def test_the_transpose_of_the_colours(space):
     lookups = _lookups(_DOMAINS[space], _rays(300, radius=0.1))
     mips = tuple(_random_pyramid()[::-1])
     slopes = jnp.asarray(np.random.default_rng(2).normal(size=(150, 3)), jnp.float32)
-    forward = jnp.sum(backdrop.colours(mips, lookups, pixels=150) * slopes)
-    back = backdrop.transposed(slopes, lookups, resolution=_SIDE)
-    backward = sum(jnp.sum(a * b) for a, b in zip(mips, back, strict=True))
+    forward = np.vdot(_colours(mips, lookups, pixels=150), slopes)
+    back = _transposed(slopes, lookups, resolution=_SIDE)
+    backward = sum(np.vdot(a, b) for a, b in zip(mips, back, strict=True))
     np.testing.assert_allclose(forward, backward, rtol=1e-4)
 
 
@@ -133,17 +145,17 @@ def test_a_wall_is_interpolated_bilinearly_at_the_point_where_the_ray_leaves():
     # Columns of a wall are along the next axis, rows along the one after: z, then x.
     expected = 0.5 * _SIDE * (np.array([-0.7, 0.3]) / 2.0 + 1.0)
     np.testing.assert_allclose(_middles(lookups)[0], expected, atol=1e-4)
-    grid = np.asarray(backdrop.mipmap(_random_pyramid(), "bounded")[0])[3]
+    grid = np.asarray(_mipmap(_random_pyramid(), "bounded")[0])[3]
     column, row = np.floor(expected).astype(int)
     right, up = expected - (column, row)
     across = grid[row : row + 2, column] * (1 - right) + grid[row : row + 2, column + 1] * right
-    seen = backdrop.colours(backdrop.mipmap(_random_pyramid(), "bounded"), lookups, pixels=1)
+    seen = _colours(_mipmap(_random_pyramid(), "bounded"), lookups, pixels=1)
     np.testing.assert_allclose(seen[0], across[0] * (1 - up) + across[1] * up, rtol=1e-3)
 
 
 @pytest.mark.parametrize("space", ["spherical", "unbounded"])
 def test_there_are_no_seams(space):
-    mips = backdrop.mipmap(_random_pyramid(), space)
+    mips = _mipmap(_random_pyramid(), space)
     domain = Domain(2.0, space)
     random = np.random.default_rng(3)
     for axis, other in ((0, 1), (1, 2), (2, 0)):
@@ -169,7 +181,7 @@ def test_there_are_no_seams(space):
                 starts=lookups.starts * (side / _SIDE),
             )
             first += 6 * (side + 1) ** 2
-            seen = backdrop.colours(mips, coarser, pixels=80)
+            seen = _colours(mips, coarser, pixels=80)
             np.testing.assert_allclose(seen[:40], seen[40:], atol=2e-3)
 
 
@@ -192,9 +204,9 @@ def test_a_wide_footprint_reads_the_mean_of_its_surroundings():
     grid = np.zeros((6, _SIDE + 1, _SIDE + 1, 3), np.float32)
     grid[:, ::2] = 1.0  # stripes of one cell
     pyramid = (*backdrop.init(_SIDE)[:-1], jnp.asarray(grid))
-    mips = backdrop.mipmap(pyramid, "bounded")
+    mips = _mipmap(pyramid, "bounded")
     narrow, wide = (_lookups(_DOMAINS["bounded"], _rays(200, radius=r)) for r in (1e-5, 0.5))
-    seen = [np.std(backdrop.colours(mips, lookups, pixels=100)) for lookups in (narrow, wide)]
+    seen = [np.std(_colours(mips, lookups, pixels=100)) for lookups in (narrow, wide)]
     assert seen[0] > 0.3 and seen[1] < 0.2 * seen[0]
 
 
@@ -210,7 +222,7 @@ def test_places_and_axes_are_finite_at_the_extremes():
 def test_a_coarse_level_is_interpolated_exactly_on_finer_grids():
     first, *others = backdrop.init(_SIDE)
     ramp = jnp.broadcast_to(jnp.arange(5.0)[None, None, :, None], first.shape)
-    finest = backdrop.mipmap((ramp, *others), "bounded")[0]
+    finest = _mipmap((ramp, *others), "bounded")[0]
     expected = np.broadcast_to(np.linspace(0.0, 4.0, _SIDE + 1)[None, None, :, None], finest.shape)
     np.testing.assert_allclose(finest, expected, atol=1e-6)
 
@@ -220,6 +232,8 @@ def test_gradients_by_radiance_and_throughput_are_finite_differences(space):
     lookups, pyramid = _lookups(_DOMAINS[space], _rays(40, radius=0.1)), _random_pyramid()
     target = jnp.asarray(np.random.default_rng(5).uniform(size=(20, 3)), jnp.float32)
 
+    @jax.jit
+    @functools.partial(jax.value_and_grad, argnums=(0, 1))
     def loss(pyramid, throughput):
         seen = backdrop.colours(
             backdrop.mipmap(pyramid, space), lookups._replace(throughput=throughput), pixels=20
@@ -227,16 +241,16 @@ def test_gradients_by_radiance_and_throughput_are_finite_differences(space):
         return jnp.sum(jnp.square(seen - target))
 
     given = pyramid, lookups.throughput
-    slopes = jax.jit(jax.grad(loss, argnums=(0, 1)))(*given)
+    _, slopes = loss(*given)
     random = np.random.default_rng(6)
     for number in range(2):
-        towards = jax.tree.map(
-            lambda x: jnp.asarray(random.normal(size=x.shape), jnp.float32), given[number]
-        )
+        towards = jax.tree.map(lambda x: np.float32(random.normal(size=x.shape)), given[number])
         values = []
         for step in (1e-2, -1e-2):
-            moved = jax.tree.map(lambda x, y, step=step: x + step * y, given[number], towards)
-            values.append(float(loss(*(moved if n == number else given[n] for n in range(2)))))
+            moved = jax.tree.map(
+                lambda x, y, step=step: np.asarray(x) + np.float32(step) * y, given[number], towards
+            )
+            values.append(float(loss(*(moved if n == number else given[n] for n in range(2)))[0]))
         pairs = zip(jax.tree.leaves(slopes[number]), jax.tree.leaves(towards), strict=True)
-        expected = float(sum(jnp.sum(a * b) for a, b in pairs))
+        expected = sum(np.sum(a * b) for a, b in pairs)
         np.testing.assert_allclose((values[0] - values[1]) / 2e-2, expected, rtol=5e-3)
