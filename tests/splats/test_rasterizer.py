@@ -1,5 +1,7 @@
 """Blending and its derivative, in both forms, against a plain blend in float64 and closed forms."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -42,16 +44,37 @@ def _blended(projected, grid=_GRID, capacity=_CAPACITY):
     return rasterizer.rasterize(projected, lists, grid)
 
 
+_PROJECT = jax.jit(_projected, static_argnames="grid")
+
+
+def _compiled(function, *fixed):
+    """Returns a function of this module in one program, for the form that is set.
+
+    JAX knows programs by their functions alone, which are the same for both forms.
+    """
+    return _compiled_for(rasterizer._forward, function, *fixed)
+
+
+@functools.cache
+def _compiled_for(form, function, *fixed):
+    del form
+    return jax.jit(lambda *arguments: function(*arguments, *fixed))
+
+
+def _rendered(values, view, grid):
+    return _blended(_projected(values, view, grid), grid)
+
+
 def _image(values, view=made_splats.AHEAD, grid=_SMALL):
     """Returns the blend of Gaussians."""
-    return jax.jit(lambda values: _blended(_projected(values, view, grid), grid))(values)
+    return _compiled(_rendered, grid)(values, view)
 
 
 @pytest.fixture(scope="module")
 def scene():
     """300 Gaussians, and their image as the reference has it."""
     values, view = made_splats.gaussians(300), made_splats.view()
-    found = jax.device_get(jax.jit(lambda v: _projected(v, view))(values))
+    found = jax.device_get(_PROJECT(values, view))
     visible = np.flatnonzero(found.radii[:, 0] > 0)
     exact = jax.tree.map(np.float64, jax.tree.map(lambda x: x[visible], found))
     seen = reference_splats.blend(
@@ -63,7 +86,7 @@ def scene():
 def test_the_image_is_that_of_a_plain_blend(form, scene):
     _, _, found, visible, _, (image, left, _) = scene
     assert len(visible) > 100 and left.min() < 0.01 and left.max() > 0.2
-    seen = jax.jit(_blended)(jax.tree.map(jnp.asarray, found))
+    seen = _compiled(_blended, _GRID, _CAPACITY)(found)
     np.testing.assert_allclose(seen.colours, image, atol=1e-5)
     np.testing.assert_allclose(seen.transmittance, left, atol=1e-5)
 
@@ -106,13 +129,11 @@ def test_the_derivatives_of_gaussians_are_those_of_float64(form, scene):
     )
     with jax.enable_x64(True):
         wide, eye = jax.tree.map(lambda x: jnp.float64(np.asarray(x)), (values, view))
-        _, pull_back = jax.vjp(lambda v: _projected(v, eye), wide)
-        zero = jax.tree.map(lambda x: jnp.zeros_like(jnp.float64(x)), _projected(wide, eye))
-        names = ("means", "conics", "opacities", "colours")
-        filled = {
-            n: getattr(zero, n).at[visible].set(s) for n, s in zip(names, slopes, strict=True)
-        }
-        (expected,) = pull_back(zero._replace(**filled))
+        projected, pull_back = jax.vjp(lambda v: _PROJECT(v, eye), wide)
+        filled = jax.tree.map(lambda x: np.zeros(x.shape), projected)
+        for name, slope in zip(("means", "conics", "opacities", "colours"), slopes, strict=True):
+            getattr(filled, name)[visible] = slope
+        (expected,) = pull_back(jax.tree.map(jnp.asarray, filled))
     for theirs, mine in zip(expected, ours, strict=True):
         np.testing.assert_allclose(mine, theirs, atol=1e-4 * np.abs(theirs).max())
 
@@ -212,29 +233,33 @@ def test_moving_scene_and_camera_together_changes_nothing(form):
 
 def test_an_image_depends_on_neither_tiles_nor_capacity(form, scene):
     values, view, *_ = scene
-    found = _projected(values, view)
-    blended = jax.jit(_blended, static_argnames=("grid", "capacity"))
-    first = blended(found)
+    found = _PROJECT(values, view)
+    first = _compiled(_blended, _GRID, _CAPACITY)(found)
     for tile in (4, 16):
-        for ours, theirs in zip(first, blended(found, grid=Grid(*_SIZE, tile)), strict=True):
+        other = _compiled(_blended, Grid(*_SIZE, tile), _CAPACITY)(found)
+        for ours, theirs in zip(first, other, strict=True):
             np.testing.assert_allclose(ours, theirs, atol=1e-6)
     total = int(images.count_entries(found, _GRID))
-    for ours, theirs in zip(first, blended(found, capacity=total), strict=True):
+    for ours, theirs in zip(first, _compiled(_blended, _GRID, total)(found), strict=True):
         np.testing.assert_array_equal(ours, theirs)
 
 
+def _listed(projected, capacity):
+    return images.make_lists(projected, _GRID, capacity=capacity)
+
+
 def test_lists_report_what_they_need(form):
-    found = _projected(made_splats.gaussians(300), made_splats.view())
+    found = _PROJECT(made_splats.gaussians(300), made_splats.view())
     total = int(images.count_entries(found, _GRID))
     for capacity in (1, total // 2, total, 2 * total):
-        lists = images.make_lists(found, _GRID, capacity=capacity)
+        lists = _compiled(_listed, capacity)(found)
         assert int(lists.total) == total
         assert int(lists.offsets[-1]) == min(total, capacity)
         assert np.all(np.asarray(lists.entries) < 300)
 
 
 def test_both_lists_are_equal():
-    found = _projected(made_splats.gaussians(300), made_splats.view())
+    found = _PROJECT(made_splats.gaussians(300), made_splats.view())
     boxes = images._boxes(found.means, found.radii, _GRID)
     order = jnp.argsort(found.depths, stable=True).astype(jnp.int32)
     boxes = jax.tree.map(lambda x: x[order], boxes)
@@ -263,14 +288,16 @@ def test_a_list_longer_than_a_chunk(form):
     values = made_splats.joined(*layers)
 
     def left(values):
-        return _blended(_projected(values, made_splats.AHEAD, _SMALL), _SMALL)
+        seen = _rendered(values, made_splats.AHEAD, _SMALL)
+        return jnp.sum(seen.transmittance), seen
 
-    seen = jax.jit(left)(values)
+    left = jax.jit(jax.grad(left, has_aux=True))
+    slopes, seen = left(values)
     np.testing.assert_allclose(seen.transmittance[8, 8], 0.95**100, rtol=2e-3)
-    slopes = jax.jit(jax.grad(lambda v: jnp.sum(left(v).transmittance)))(values).logits
+    slopes = slopes.logits
     np.testing.assert_allclose(slopes, np.full(100, slopes.mean()), rtol=2e-2)
     thick = values._replace(logits=jnp.full(100, 2.0))
-    assert 1e-4 < float(jax.jit(left)(thick).transmittance[8, 8]) < 1e-2
+    assert 1e-4 < float(left(thick)[1].transmittance[8, 8]) < 1e-2
 
 
 def test_opaque_gaussians_keep_a_thousandth_and_have_finite_derivatives(form):
@@ -278,19 +305,19 @@ def test_opaque_gaussians_keep_a_thousandth_and_have_finite_derivatives(form):
         made_splats.one((0, 0, 2), scale=50, opacity=1.0),
         made_splats.one((0, 0, 3), scale=50, opacity=1.0, colour=(0, 1, 0)),
     )
-    seen = _image(values)
+
+    def total(values):
+        seen = _rendered(values, made_splats.AHEAD, _SMALL)
+        return jnp.sum(seen.colours), seen
+
+    slopes, seen = jax.jit(jax.grad(total, has_aux=True))(values)
     # The second would bring the transmittance to 1e-6, so that the pixel ends before it.
     assert float(seen.transmittance[8, 8]) == pytest.approx(0.001, rel=1e-2)
-    slopes = jax.jit(
-        jax.grad(
-            lambda v: jnp.sum(_blended(_projected(v, made_splats.AHEAD, _SMALL), _SMALL).colours)
-        )
-    )(values)
     assert gradients.all_finite(slopes)
 
 
 def test_records_have_no_gaussian_that_is_not_visible(form):
     """A hidden Gaussian has a radius of 0, so that no list has it."""
     hidden = Projected(*(jnp.zeros((3, *s), jnp.float32) for s in ((2,), (3,), (), (3,), (), (2,))))
-    seen = _blended(hidden, _SMALL)
+    seen = _compiled(_blended, _SMALL, _CAPACITY)(hidden)
     assert np.all(seen.transmittance == 1.0)
