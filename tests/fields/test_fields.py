@@ -260,15 +260,20 @@ def test_transformations_change_nothing(name, transformation):
 _HALF = 0.05
 
 
-def _taught(name, precision, params, gaussians):
-    """Returns what a field answers and its gradient, of the sum of the answer."""
+@functools.cache
+def _learning(name, precision):
     config = dataclasses.replace(_CONFIGS[name], precision=precision)
 
-    def total(params):
-        seen = list(_ask(params, config, gaussians, _direction()))
+    def total(params, gaussians, direction):
+        seen = list(_ask(params, config, gaussians, direction))
         return sum(map(jnp.sum, seen)), seen
 
-    slopes, seen = jax.jit(jax.grad(total, has_aux=True))(params)
+    return jax.jit(jax.grad(total, has_aux=True))
+
+
+def _taught(name, precision, params, gaussians):
+    """Returns what a field answers and its gradient, of the sum of the answer."""
+    slopes, seen = _learning(name, precision)(params, gaussians, _direction())
     return jax.tree.leaves(seen), slopes
 
 

@@ -134,13 +134,20 @@ def test_a_path_ends_on_an_opaque_surface_inside_the_glass(interior):
     assert float(free.far) == float(_warp(_MODELS[interior], made).far) > float(warp.far)
 
 
-def test_samples_reach_from_the_near_to_the_far_plane():
-    config = dataclasses.replace(_FIELD, space="unbounded", near=0.5, far=150.0, radius=10.0)
-    path = jax.tree.map(jnp.asarray, _tree_item(_straight_paths(), 0))
+@functools.partial(jax.jit, static_argnums=(1, 2))
+def _first_samples(path, config, count):
     line = polylines.whole_path(path)
     still = Jitter(jnp.float32(0.0), jnp.float32(0.0))
     warp = volume_rendering.distance_warp(config, line)
-    t = volume_rendering.sample(config, line, warp, [], 9, jitter=still, anneal=jnp.float32(1.0)).t
+    return volume_rendering.sample(
+        config, line, warp, [], count, jitter=still, anneal=jnp.float32(1.0)
+    )
+
+
+def test_samples_reach_from_the_near_to_the_far_plane():
+    config = dataclasses.replace(_FIELD, space="unbounded", near=0.5, far=150.0, radius=10.0)
+    path = jax.tree.map(jnp.asarray, _tree_item(_straight_paths(), 0))
+    t = _first_samples(path, config, 9).t
     np.testing.assert_allclose([t[0], t[-1]], [0.5, 150.0], rtol=_DISTANCE)
     # Zip-NeRF's power transformation in units of 10, where it is linear up to about 1.
     s = [1.0 - (1.0 + x / 12.5) ** -1.5 for x in (0.5, float(t[4]), 150.0)]
@@ -457,20 +464,16 @@ def test_samples_gradients_and_lookups_of_a_moved_model_are_the_same(space):
     moved = dataclasses.replace(usual, centre=tuple(centre.tolist()))
     results = []
     for config, shift in ((usual, np.zeros(3, np.float32)), (moved, centre)):
-        line = polylines.whole_path(jax.tree.map(jnp.asarray, _bent()))
-        line = line._replace(points=line.points + np.broadcast_to(shift, line.points.shape))
-        warp = volume_rendering.distance_warp(config, line)
-        jitter = Jitter(jnp.float32(0.0), jnp.float32(0.0))
-        found = volume_rendering.sample(
-            config, line, warp, [], 8, jitter=jitter, anneal=jnp.float32(1.0)
-        )
+        path = jax.tree.map(jnp.asarray, _bent())
+        path = path._replace(points=path.points + np.broadcast_to(shift, path.points.shape))
+        found = _first_samples(path, config, 8)
 
         def density(params, config=config, shift=shift):
             point, towards = jnp.array([1.0, 2.0, -3.0]) + shift, jnp.array([0.0, 0.0, 1.0])
             return look_up(params, config, point, towards, width=0.1).density
 
-        gradient = jax.grad(density)(_params(usual))
-        results.append((found.gaussians, found.t, gradient.field, density(_params(usual))))
+        value, gradient = jax.jit(jax.value_and_grad(density))(_params(usual))
+        results.append((found.gaussians, found.t, gradient.field, value))
     for old, new in zip(*map(jax.tree.leaves, results), strict=True):
         np.testing.assert_allclose(new, old, rtol=1e-4, atol=1e-5)
 
