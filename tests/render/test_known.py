@@ -198,14 +198,18 @@ def test_a_scene_that_is_moved_as_a_whole_gives_the_same_image(rays, kind):
 _CAMERA = cameras.orbit(2, distance=4.0, elevation=0.3, size=12, angle_x=0.9)
 
 
+# Four rays in each pixel: one program for all images.
+_TILE = 576
+
+
 def _uniform(scene, radiance, side, view=0):
     rays = cameras.image_rays(cameras.supersample(_CAMERA, side), view)
-    seen = render_known(scene, radiance, rays, settings=TREE)
+    seen = render_known(scene, radiance, rays, settings=TREE, tile=_TILE)
     return cameras.box_filter(seen.linear, side), seen.casts
 
 
 def _image(scene, radiance, *, view=0, **options):
-    return render_known_camera(scene, radiance, _CAMERA, view, settings=TREE, **options)
+    return render_known_camera(scene, radiance, _CAMERA, view, settings=TREE, tile=_TILE, **options)
 
 
 @pytest.mark.parametrize("view", [0, 1])
@@ -225,7 +229,7 @@ def _stripes(origin, direction):
 def test_pixels_whose_rays_differ_from_neighbours_get_more_rays(scene):
     seen = _image(scene, _stripes, refined_rays_per_pixel=25, tolerance=0.2)
     rays = cameras.image_rays(cameras.supersample(_CAMERA, 2), 0)
-    first = render_known(scene, _stripes, rays, settings=TREE).rgb
+    first = render_known(scene, _stripes, rays, settings=TREE, tile=_TILE).rgb
     high, low = (f(first, (3, 3, 1), mode="nearest") for f in (maximum_filter, minimum_filter))
     contrast = (high - low).reshape(12, 2, 12, 2, 3).max(axis=(1, 3, 4))
     clear = np.abs(contrast - 0.2) > 1e-5  # of rounding
