@@ -42,6 +42,7 @@ def _trained(config, size=0.6):
     return jax.tree.map(lambda x: jnp.float32(size * rng.normal(size=x.shape)), initial)
 
 
+@functools.cache
 def _initial(config):
     return jax.jit(lambda: neus.init_radiance(jax.random.key(0), config))()
 
@@ -241,6 +242,18 @@ def test_annealing_depends_on_the_progress():
     assert depths[0] > depths[1] > depths[2] > 0.0
 
 
+@functools.cache
+def _slopes_of_intervals(config):
+    """Returns the slopes of what an interval stops and shows, and its depth: one program."""
+
+    def stopped(params, point, length):
+        seen = neus.radiance(params, config, _at(point), _TOWARDS)
+        depth = registry.depth(params, config, seen, -_TOWARDS, length, jnp.float32(1.0))
+        return -jnp.expm1(-depth) + jnp.sum(seen.rgb), depth
+
+    return jax.jit(jax.grad(stopped, has_aux=True))
+
+
 @pytest.mark.parametrize("config", [_NEUS, _UNISURF], ids=["neus", "unisurf"])
 @pytest.mark.parametrize("log_sharpness", [-20.0, 0.0, 20.0])
 @pytest.mark.parametrize("length", [0.0, 1e-20, 1.0, 1e30])
@@ -248,17 +261,9 @@ def test_intervals_are_finite_with_their_gradients(config, log_sharpness, length
     params = _trained(config)
     if params.log_sharpness is not None:
         params = params._replace(log_sharpness=jnp.float32(log_sharpness))
-
-    def stopped(params, point):
-        seen = neus.radiance(params, config, _at(point), _TOWARDS)
-        depth = registry.depth(
-            params, config, seen, -_TOWARDS, jnp.float32(length), jnp.float32(1.0)
-        )
-        return -jnp.expm1(-depth) + jnp.sum(seen.rgb), depth
-
-    slopes = jax.jit(jax.grad(stopped, has_aux=True))
+    slopes = _slopes_of_intervals(config)
     for point in ([0.5, 0.5, 0.5], [0.45, 0.5, 0.55], [0.55, 0.6, 0.5], [0.0, 1.0, 0.3]):
-        assert gradients.all_finite(slopes(params, point)), point
+        assert gradients.all_finite(slopes(params, point, jnp.float32(length))), point
 
 
 # --- signed value, slope and curvature ---
