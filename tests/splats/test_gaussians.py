@@ -43,10 +43,11 @@ def _as_recorded(recorded, dtype=np.float64):
     return jax.tree.map(lambda x: jnp.asarray(x, dtype), (values, view))
 
 
+_project_all = jax.jit(splats.project_all, static_argnames=("kernel", "width", "height"))
+
+
 def _projected(values, view, kernel="classic", **changes):
-    return jax.jit(
-        functools.partial(splats.project_all, kernel=kernel, **(_SIZE | changes)),
-    )(values, view)
+    return _project_all(values, view, kernel=kernel, **(_SIZE | changes))
 
 
 def test_projection_is_that_of_gsplat(recorded):
@@ -167,16 +168,18 @@ _EXTREMES = {
 }
 
 
+@functools.partial(jax.jit, static_argnames="kernel")
+@functools.partial(jax.grad, has_aux=True)
+def _slopes_of_all(values, *, kernel):
+    """Returns the slopes of the sum of all that is projected, and what is projected."""
+    found = splats.project_all(values, made_splats.AHEAD, width=16, height=16, kernel=kernel)
+    return sum(map(jnp.sum, found)), found
+
+
 @pytest.mark.parametrize("name", _EXTREMES)
 @pytest.mark.parametrize("kernel", ["classic", "mip"])
 def test_projection_is_finite_and_so_are_its_derivatives(name, kernel):
-    values = made_splats.one(**_EXTREMES[name])
-
-    def total(values):
-        found = splats.project_all(values, made_splats.AHEAD, width=16, height=16, kernel=kernel)
-        return sum(map(jnp.sum, found)), found
-
-    slopes, found = jax.jit(jax.grad(total, has_aux=True))(values)
+    slopes, found = _slopes_of_all(made_splats.one(**_EXTREMES[name]), kernel=kernel)
     assert gradients.all_finite(found) and gradients.all_finite(slopes)
     if not found.radii[0, 0]:
         assert not any(np.any(leaf) for leaf in jax.tree.leaves((found, slopes)))
