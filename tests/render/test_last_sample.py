@@ -1,6 +1,7 @@
 """The last interval of a path is opaque: a field evaluated at its end is a painted wall."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -41,9 +42,14 @@ def _head_on():
 
 
 def _sample(config, path, *, count=4, offset=0.0):
-    line = volume_rendering.polyline(config, jax.tree.map(jnp.asarray, path))
+    return _samples(config, jax.tree.map(jnp.asarray, path), count, jnp.float32(offset))
+
+
+@functools.partial(jax.jit, static_argnums=(0, 2))
+def _samples(config, path, count, offset):
+    line = volume_rendering.polyline(config, path)
     warp = volume_rendering.distance_warp(config, line)
-    jitter = Jitter(jnp.float32(offset), jnp.float32(0.2))
+    jitter = Jitter(offset, jnp.float32(0.2))
     return volume_rendering.sample(
         config, line, warp, [], count, jitter=jitter, anneal=jnp.float32(1.0)
     )
@@ -78,18 +84,27 @@ def _paint(monkeypatch, fog):
     monkeypatch.setattr(registry, "radiance", radiance)
 
 
-def _render_painted(monkeypatch, config, path, *, offset=0.0, fog=0.0):
-    """Returns the colour of a path, and a function of its derivatives."""
+def _render_painted(monkeypatch, config, path, *, offset=0.0, fog=0.0, strength=1.0):
+    """Returns what is seen of a path, and the derivatives of its colour by the strength."""
     _paint(monkeypatch, fog)
-    paths = made_paths.stack([path])
-    jitter = Jitter(jnp.full((1, 2), offset, jnp.float32), jnp.full((1, 2), 0.2, jnp.float32))
+    return _painted(config, fog)(
+        jnp.float32(strength), made_paths.stack([path]), jnp.float32(offset)
+    )
 
-    def red_green_blue(strength):
+
+@functools.cache
+def _painted(config, fog):
+    """Returns the program that renders paths through fields that `_paint` has painted."""
+    del fog  # Part of what is compiled.
+
+    def see(strength, paths, offset):
+        jitter = Jitter(jnp.full((1, 2), offset), jnp.full((1, 2), 0.2, jnp.float32))
         params = Params(proposals=(strength,), field=strength)
         seen = pixels.render_paths(params, config, paths, jitter, anneal=jnp.float32(1.0))
-        return seen.composite.rgb[0]
+        return seen.composite.rgb[0], seen.composite
 
-    return jax.jit(red_green_blue)(jnp.float32(1.0)), jax.jit(jax.jacrev(red_green_blue))
+    slopes = jax.jacrev(see, has_aux=True)
+    return jax.jit(lambda *arguments: slopes(*arguments)[::-1])
 
 
 @pytest.mark.parametrize("multisamples", [1, 6])
@@ -98,14 +113,15 @@ def _render_painted(monkeypatch, config, path, *, offset=0.0, fog=0.0):
 def test_a_painted_wall_is_seen_exactly(monkeypatch, space, order, offset, multisamples):
     config = dataclasses.replace(_END, space=space, multisamples=multisamples, samples=2)
     wall = _in_unit_cube(_exit(_bent(), order)[0])
-    got, gradient = _render_painted(monkeypatch, config, _bent(), offset=offset)
+    got = _render_painted(monkeypatch, config, _bent(), offset=offset)[0].rgb[0]
     # Of the six points around the end of the path, three may lie beyond the wall.
     footprint = 0.0 if multisamples == 1 else _RADIUS
     np.testing.assert_allclose(got, wall, atol=_ROUNDING + footprint)
-    np.testing.assert_allclose(gradient(jnp.float32(2.0)), got, atol=_ROUNDING)
+    _, gradient = _render_painted(monkeypatch, config, _bent(), offset=offset, strength=2.0)
+    np.testing.assert_allclose(gradient, got, atol=_ROUNDING)
     before = dataclasses.replace(config, last_sample="middle")
     short, _ = _render_painted(monkeypatch, before, _bent(), offset=offset)
-    assert np.max(np.abs(np.asarray(short) - wall)) > 0.01
+    assert np.max(np.abs(np.asarray(short.rgb[0]) - wall)) > 0.01
 
 
 def test_an_opaque_surface_is_seen_where_the_path_ends_on_it(monkeypatch):
@@ -113,15 +129,12 @@ def test_an_opaque_surface_is_seen_where_the_path_ends_on_it(monkeypatch):
     stopped = path._replace(stop=Stop(path.tau[2] + jnp.float32(2.0), None))
     point = np.asarray(path.points[2]) + 2.0 * np.asarray(path.directions[2])
     got, _ = _render_painted(monkeypatch, _END, stopped)
-    np.testing.assert_allclose(got, _in_unit_cube(point), atol=_ROUNDING)
+    np.testing.assert_allclose(got.rgb[0], _in_unit_cube(point), atol=_ROUNDING)
 
 
 def _distances(monkeypatch, config, path, *, fog=0.0):
     """Returns the median and mean distances of a path."""
-    _paint(monkeypatch, fog)
-    params = Params(proposals=(jnp.float32(1.0),), field=jnp.float32(1.0))
-    paths, jitter = made_paths.stack([path]), Jitter(*jnp.zeros((2, 1, 2), jnp.float32))
-    seen = pixels.render_paths(params, config, paths, jitter, anneal=jnp.float32(1.0)).composite
+    seen, _ = _render_painted(monkeypatch, config, path, fog=fog)
     return np.array([seen.median[0], seen.mean[0]])
 
 
@@ -142,7 +155,7 @@ def test_the_distance_of_what_is_in_front_of_the_wall_is_as_before(monkeypatch):
 
 def test_what_is_in_front_of_the_wall_hides_it_as_before(monkeypatch):
     seen = [_render_painted(monkeypatch, config, _bent(), fog=1e3)[0] for config in (_MIDDLE, _END)]
-    np.testing.assert_array_equal(*seen)
+    np.testing.assert_array_equal(*(each.rgb for each in seen))
 
 
 @pytest.mark.parametrize(("space", "order"), [("bounded", np.inf), ("spherical", 2)])
@@ -199,19 +212,29 @@ def test_an_unbounded_scene_is_unchanged(multisamples):
         np.testing.assert_array_equal(old, new)
 
 
-@pytest.mark.parametrize("multisamples", [1, 6])
-@pytest.mark.parametrize("distance", [0.0, 7.5, 300.0])
-def test_values_and_gradients_are_finite_wherever_the_camera_is(distance, multisamples):
-    config = dataclasses.replace(_END, multisamples=multisamples)
-    path = made_paths.path([], [[0, 0, 1]], [0], origin=(0.0, 0.0, distance))
-    params = init_params(jax.random.key(0), config)
+@functools.cache
+def _brightness(config):
+    """Returns the program of the sum of colours of a path, and of its slopes."""
 
-    def brightness(params, points):
+    def brightness(params, points, path):
         paths = made_paths.stack([path._replace(points=points)])
         jitter = pixels.no_jitter(config, 1)
         seen = pixels.render_paths(params, config, paths, jitter, anneal=jnp.float32(1.0))
         return jnp.sum(seen.composite.rgb)
 
-    both = jax.jit(jax.value_and_grad(brightness, argnums=(0, 1)))(params, path.points)
+    return jax.jit(jax.value_and_grad(brightness, argnums=(0, 1)))
+
+
+@functools.cache
+def _initial(config):
+    return jax.jit(lambda: init_params(jax.random.key(0), config))()
+
+
+@pytest.mark.parametrize("multisamples", [1, 6])
+@pytest.mark.parametrize("distance", [0.0, 7.5, 300.0])
+def test_values_and_gradients_are_finite_wherever_the_camera_is(distance, multisamples):
+    config = dataclasses.replace(_END, multisamples=multisamples)
+    path = made_paths.path([], [[0, 0, 1]], [0], origin=(0.0, 0.0, distance))
+    both = _brightness(config)(_initial(config), path.points, path)
     assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(both))
     assert any(bool(jnp.any(leaf != 0.0)) for leaf in jax.tree.leaves(both[1][0].field))
