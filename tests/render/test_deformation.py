@@ -236,33 +236,37 @@ def test_a_far_sky_can_move_behind_a_polyline():
 # --- gradients ---
 
 
+@functools.partial(jax.jit, static_argnums=1)
+@jax.grad
+def _slopes_of_colours(params, config, path):
+    return jnp.sum(_seen(config, params, path).composite.rgb)
+
+
 @pytest.mark.parametrize("space", _SPACES)
 @pytest.mark.parametrize("kind", _KINDS)
 def test_colours_train_the_deformation(kind, space):
     config = _config(kind, space)
-
-    def colour(params):
-        return jnp.sum(_seen(config, params).composite.rgb)
-
-    slopes = jax.grad(colour)(_trained(config))
+    slopes = _slopes_of_colours(_trained(config), config, _path())
     assert gradients.all_finite(slopes)
     assert all(np.any(leaf) for leaf in jax.tree.leaves(slopes.field.deformation))
     # Also where all offsets are 0, as at the beginning: with zero steps, and zero lengths.
-    slopes = jax.grad(colour)(_with_offset(_trained(config)))
+    slopes = _slopes_of_colours(_with_offset(_trained(config)), config, _path())
     assert gradients.all_finite(slopes)
 
 
 def test_proposals_do_not_train_the_deformation():
     config = _config("raydef")
 
-    def weight(params, level):
+    @functools.partial(jax.jit, static_argnums=1)
+    @jax.grad
+    def slopes(params, level):
         return jnp.sum(jnp.square(_seen(config, params).histograms[level].weights))
 
     params = _trained(config)
-    first = jax.grad(weight)(params, 0)
+    first = slopes(params, 0)
     assert not any(np.any(leaf) for leaf in jax.tree.leaves(first.field))
     assert any(np.any(leaf) for leaf in jax.tree.leaves(first.proposals))
-    last = jax.grad(weight)(params, -1)
+    last = slopes(params, -1)
     assert any(np.any(leaf) for leaf in jax.tree.leaves(last.field.deformation))
 
 
@@ -270,9 +274,7 @@ def test_the_end_of_the_training_is_the_default_progress():
     config = _config("raydef")
     params, still = _trained(config), Jitter(jnp.zeros(2), jnp.zeros(2))
     half, done = (
-        volume_rendering.path_radiance(
-            params, config, _path(), still, _ONE, progress=jnp.float32(x)
-        ).composite
+        _radiance(params, config, _path(), still, _ONE, progress=jnp.float32(x)).composite
         for x in (0.02, 1.0)
     )
     np.testing.assert_allclose(_seen(config, params).composite.rgb, done.rgb, atol=1e-6)
