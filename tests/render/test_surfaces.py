@@ -42,17 +42,19 @@ _PROPOSALS = tuple(
 _CONFIG = dataclasses.replace(
     MODEL, field=NeusConfig(**_SHAPE), proposals=_PROPOSALS, samples=96, last_sample="end"
 )
-_KINDS = pytest.mark.parametrize(
-    "config",
-    [_CONFIG, dataclasses.replace(_CONFIG, field=UnisurfConfig(**_SHAPE))],
-    ids=["neus", "unisurf"],
-)
+_UNISURF = dataclasses.replace(_CONFIG, field=UnisurfConfig(**_SHAPE))
+_KINDS = pytest.mark.parametrize("config", [_CONFIG, _UNISURF], ids=["neus", "unisurf"])
 _ONE = jnp.float32(1.0)
 _radiance = jax.jit(volume_rendering.path_radiance, static_argnums=1)
 
 
+@functools.cache
+def _initial(config):
+    return jax.jit(lambda: init_params(jax.random.key(0), config))()
+
+
 def _params(config, sharpness=None):
-    params = jax.jit(lambda: init_params(jax.random.key(0), config))()
+    params = _initial(config)
     if sharpness is None:
         return params
     sharper = params.field._replace(log_sharpness=jnp.log(jnp.float32(sharpness)))
@@ -130,8 +132,15 @@ def test_the_end_of_the_training_is_the_default_progress():
     assert not np.array_equal(first.histograms[-1].weights, last.histograms[-1].weights)
 
 
-@_KINDS
-@pytest.mark.parametrize("settings", [STRAIGHT, TREE], ids=["straight", "tree"])
+@pytest.mark.parametrize(
+    ("config", "settings"),
+    [
+        pytest.param(_CONFIG, STRAIGHT, id="neus-straight"),
+        pytest.param(_CONFIG, TREE, id="neus-tree"),
+        pytest.param(_UNISURF, STRAIGHT, id="unisurf-straight"),
+        pytest.param(_UNISURF, TREE, marks=pytest.mark.slow, id="unisurf-tree"),
+    ],
+)
 def test_it_renders_along_straight_and_bent_paths(config, settings):
     scene = scenes.build(scenes.ball(1.3, subdivisions=1))
     rays = scenes.rays([[-4.0, 0.21, 0.33], [-4.0, 3.0, 0.0]], [1.0, 0.02, 0.01])
@@ -143,22 +152,24 @@ def test_it_renders_along_straight_and_bent_paths(config, settings):
     assert np.all(np.asarray(seen.linear) <= 1.0011) and np.std(seen.linear) > 0.0
 
 
+@functools.partial(jax.jit, static_argnums=1)
+@jax.value_and_grad
+def _sum_of_a_path(params, config):
+    path = jax.tree.map(jnp.asarray, _straight())
+    jitter = Jitter(jnp.zeros(2), jnp.zeros(2))
+    seen = volume_rendering.path_radiance(params, config, path, jitter, _ONE)
+    sums = sum(map(jnp.sum, seen.surface))
+    moments = sum(jnp.sum(jnp.square(each.weights)) for each in seen.histograms)
+    return jnp.sum(seen.composite.rgb) + sums + moments
+
+
 @_KINDS
 @pytest.mark.parametrize("size", [0.0, 0.6, 30.0])
 def test_paths_are_finite_with_their_gradients(config, size):
     shapes = jax.eval_shape(lambda: init_params(jax.random.key(0), config))
     rng = np.random.default_rng(2)
     params = jax.tree.map(lambda x: jnp.asarray(size * rng.normal(size=x.shape), x.dtype), shapes)
-    path = jax.tree.map(jnp.asarray, _straight())
-
-    def total(params):
-        jitter = Jitter(jnp.zeros(2), jnp.zeros(2))
-        seen = volume_rendering.path_radiance(params, config, path, jitter, _ONE)
-        sums = sum(map(jnp.sum, seen.surface))
-        moments = sum(jnp.sum(jnp.square(each.weights)) for each in seen.histograms)
-        return jnp.sum(seen.composite.rgb) + sums + moments
-
-    assert gradients.all_finite(jax.jit(jax.value_and_grad(total))(params))
+    assert gradients.all_finite(_sum_of_a_path(params, config))
 
 
 # --- points ---
@@ -189,9 +200,8 @@ def test_the_ball_of_a_scene_elsewhere():
     config = dataclasses.replace(_CONFIG, field=field, centre=(1.0, 2.0, 3.0))
     ball = ball_of(config)
     np.testing.assert_allclose([*ball.centre, ball.radius], [2.5, 2.0, 1.5, 3.0], atol=1e-12)
-    seen = look_up_surface(
-        _params(config), config, jnp.array([2.5, 2.0, 0.0]), jnp.array([0.0, 0.0, 1.0])
-    )
+    look = jax.jit(functools.partial(look_up_surface, _params(config), config))
+    seen = look(jnp.array([2.5, 2.0, 0.0]), jnp.array([0.0, 0.0, 1.0]))
     np.testing.assert_allclose(seen.distance, 0.0, atol=1e-5)
 
 
@@ -208,7 +218,7 @@ def test_a_density_at_a_point_is_refused(config):
 
 
 def test_a_surface_of_a_field_without_one_is_refused():
-    params = jax.jit(lambda: init_params(jax.random.key(0), MODEL))()
+    params = _initial(MODEL)
     with pytest.raises(ValueError, match=r"kind zipnerf have no surface\. Use look_up"):
         look_up_surface(params, MODEL, jnp.zeros(3), jnp.array([0.0, 0.0, 1.0]))
 
