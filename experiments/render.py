@@ -66,11 +66,7 @@ def main() -> None:
         print(f"For videos as mp4: {video.INSTALL}")
     print(f"Images: {out / 'rgb'}")
     print(f"Distance in world units: {out / 'distance'}")
-    if model.config.splats is None:
-        print(f"Next: {app.shell('view', f'--run={run}')}")
-    else:
-        splats = ("--what=splats", f"--out={run}.ply")
-        print(f"Next: {app.shell('export', f'--run={run}', *splats)}")
+    print(f"Next: {app.shell('view', f'--run={run}')}")
 
 
 def render(model: Model, seen_by: cameras.Cameras, names: tuple[str, ...], out: Path) -> list[str]:

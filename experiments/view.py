@@ -64,7 +64,8 @@ def main() -> None:
         threading.Event().wait()
     finally:
         running.stop()
-        given = (f"--run={_RUN.value}", "--what=mesh", f"--out={_RUN.value}.ply")
+        what = "mesh" if subject.has_paths else "splats"
+        given = (f"--run={_RUN.value}", f"--what={what}", f"--out={_RUN.value}.ply")
         print(f"Next: {app.shell('export', *given)}")
 
 
@@ -95,12 +96,6 @@ def read_subject(heights: tuple[int, ...]) -> session.Subject:
     config = run_folder.read_config(run)
     scene = _scene(config.scene.path)
     model = checkpoint_io.load_model(run, step=_STEP.value)
-    if model.config.splats is not None:
-        raise ValueError(
-            f"{run} consists of Gaussian splats, which have no rays to show. Use "
-            "experiments.render --views=orbit, or export them for a viewer of splats with "
-            "experiments.export --what=splats."
-        )
     return session.Subject(
         name=run.resolve().name,
         model=model,

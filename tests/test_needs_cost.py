@@ -14,6 +14,7 @@ from refref_jax.choices import Material
 from refref_jax.data import mesh_queries, meshes, scene_folder
 from refref_jax.data.scene_analysis import analyse
 from refref_jax.data.scene_assembly import assemble_scene
+from refref_jax.fields import registry
 from refref_jax.geometry.cameras import image_rays
 from refref_jax.optics import path_tracing
 from refref_jax.optics.media import SLOTS
@@ -24,7 +25,7 @@ from refref_jax.sampling import scene_bounds
 from refref_jax.training import loop
 from refref_jax.training.config import TrainConfig
 from refref_jax.training.resolve import SceneFacts, resolve
-from tests.factories import made_paths, scenes
+from tests.factories import made_paths, scenes, small_model
 from tests.factories.small_model import CAMERAS, MODEL
 
 _RAYS = jax.tree.map(lambda x: jnp.asarray(x).reshape(-1, *x.shape[2:]), image_rays(CAMERAS, 0))
@@ -74,6 +75,37 @@ def test_no_mesh_compiles_no_tracer():
     assert nothing["while"] == 0 < tracer["while"]
     assert nothing["gather"] + nothing["sort"] == 0
     assert sum(nothing.values()) < 0.05 * sum(tracer.values())
+
+
+@pytest.mark.loose
+def test_kinds_of_field_that_are_not_trained_cost_nothing(monkeypatch):
+    """A step of the usual field is the same program where no other kind exists."""
+    model, config = MODEL, small_model.CONFIG
+    state = jax.eval_shape(lambda: loop.init_state(0, model, config.schedule))
+    batches = jax.tree.map(lambda x: x[None, :32], _RAYS)
+    traced = jax.eval_shape(
+        functools.partial(
+            loop.pretrace, settings=TREE, capacity=256, detail=path_detail(model, TREE)
+        ),
+        scenes.build(_BALL),
+        batches,
+    )
+    number = jax.ShapeDtypeStruct((), jnp.int32)
+    pretraced = loop.PretracedBatches(
+        traced,
+        jax.ShapeDtypeStruct((1, 32, 3), jnp.uint8),
+        jax.ShapeDtypeStruct((12,), jnp.int32),
+    )
+
+    def lowered():
+        jax.clear_caches()
+        return loop.train_steps.lower(
+            state, pretraced, number, number, config=config, model=model
+        ).as_text()
+
+    with_all = lowered()
+    monkeypatch.setattr(registry, "KINDS", {registry.USUAL: registry.KINDS[registry.USUAL]})
+    assert lowered() == with_all
 
 
 def _render_operations(model):

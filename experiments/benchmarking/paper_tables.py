@@ -103,7 +103,7 @@ _NOTES = (
     "*Published* columns are the paper's own (arXiv 2505.05848, ablation study: convex objects of "
     "a single material, cube backgrounds), measured on its data, which differs from ours.",
     "Our DMAE is the substituted one, see the table of methods; the paper's definition is not "
-    "know.",
+    "known.",
 )
 
 

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 from scipy.spatial.transform import Rotation
 
 from refref_jax.geometry import cameras
@@ -47,6 +47,26 @@ class Viewpoint(NamedTuple):
     aspect: float
 
 
+class Window(NamedTuple):
+    """Some pixels of a camera's image: those where the given rows and columns cross.
+
+    Attributes:
+      camera: the camera, alone.
+      rows: indices of the rows.
+      columns: indices of the columns.
+    """
+
+    camera: Cameras
+    rows: Int[np.ndarray, " h"]
+    columns: Int[np.ndarray, " w"]
+
+    @property
+    def rays(self) -> Rays:
+        """Rays through the centres of the pixels, `[h, w]`."""
+        row, column = np.meshgrid(self.rows, self.columns, indexing="ij")
+        return cameras.pixel_rays(self.camera, np.zeros_like(row), row, column)
+
+
 def from_browser(
     wxyz: Float[np.ndarray, "4"], position: Float[np.ndarray, "3"], fov: float, aspect: float
 ) -> Viewpoint:
@@ -66,24 +86,22 @@ def width_of(height: int) -> int:
     return max(1, round(height * ASPECT))
 
 
-def window_rays(view: Viewpoint, height: int) -> Rays:
-    """Returns the rays of an image after cropping to its window; see the rule of the module.
+def window(view: Viewpoint, height: int) -> Window:
+    """Returns the pixels of an image after cropping to its window; see the rule of the module.
 
     Args:
       view: the window's camera.
       height: rows of the uncropped image.
 
     Returns:
-      Rays `[rows, columns]`: `height` rows or `width_of(height)` columns, and the cropped number of
-      the other. The aspect equals the window's to within two pixels.
+      Pixels in `height` rows or `width_of(height)` columns, and the cropped number of the other.
+      Their aspect equals the window's to within two pixels.
     """
     width, half = width_of(height), math.tan(0.5 * view.fov)
     focal = min(0.5 * height / half, 0.5 * width / (view.aspect * half))
     rows = _middle(height, 2.0 * focal * half)
     columns = _middle(width, 2.0 * focal * half * view.aspect)
-    row, column = np.meshgrid(rows, columns, indexing="ij")
-    own = Cameras(view.pose[None], width, height, focal)
-    return cameras.pixel_rays(own, np.zeros_like(row), row, column)
+    return Window(Cameras(view.pose[None], width, height, focal), rows, columns)
 
 
 def nearest(

@@ -73,7 +73,7 @@ class Panel:
         self._objects.on_update(lambda _: show_objects(self._objects.value))
         box = gui.add_checkbox("test cameras", False, visible=subject.views is not None)
         box.on_update(lambda _: show_cameras(box.value))
-        with gui.add_folder("light paths"):
+        with gui.add_folder("light paths", visible=subject.has_paths):
             self._paths = gui.add_markdown(_HINT)
             self._remove = gui.add_button("remove", visible=False)
 

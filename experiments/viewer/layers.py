@@ -13,7 +13,8 @@
   normals at the distances of the pixels.
 - `error`: of one test view, amplified as in `comparison`, at its own pixels.
 
-Everything is drawn in bands of rows; drawing can be cancelled between two bands.
+Everything is drawn in bands of rows; drawing can be cancelled between two bands. Gaussian splats
+have `rgb`, `distance` and `error`, and are drawn at once.
 """
 
 import math
@@ -26,10 +27,10 @@ from jaxtyping import Float, UInt8
 
 from experiments.exporting import field_mesh
 from experiments.figures import comparison
+from experiments.viewer.cameras import Window
 from refref_jax.data import image_files
 from refref_jax.data.scene_folder import Frames
 from refref_jax.fields import registry
-from refref_jax.geometry import cameras
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics.interface_rules import RULES, ambient_of
 from refref_jax.optics.light_paths import Branch
@@ -59,11 +60,11 @@ class Pixels(NamedTuple):
     """Some pixels of a test view, evenly spaced.
 
     Attributes:
-      rays: rays through the pixel centres, `[h, w]`.
-      target: true sRGB of the pixels, in `[0, 1]`.
+      window: the pixels.
+      target: their true sRGB, in `[0, 1]`.
     """
 
-    rays: Rays
+    window: Window
     target: Float[np.ndarray, "h w 3"]
 
 
@@ -112,9 +113,20 @@ def draw(
     if learned:
         return _normals_at(model, rays, whole)
     if layer == DISTANCE:
-        # From wall to wall: hardly anything inside a bounded scene is farther.
-        return comparison.colour_distances([whole], farthest=2.0 * model.config.radius)[0]
+        return _draw_distance(model, whole)
     return image_files.to_bytes(whole)
+
+
+def draw_splats(model: Model, layer: str, window: Window) -> Image:
+    """Draws a layer of Gaussian splats, which are seen by a camera instead of along rays.
+
+    Args:
+      model: model of Gaussian splats.
+      layer: `rgb` or `distance`.
+      window: pixels to draw.
+    """
+    rgb, distance = _seen(model, window)
+    return image_files.to_bytes(rgb) if layer == RGB else _draw_distance(model, distance)
 
 
 def draw_error(
@@ -126,12 +138,15 @@ def draw_error(
       The image and the root mean square of the unamplified error, of sRGB in `[0, 1]`; `None` if it
       was cancelled.
     """
-    bands = []
-    for band in _bands(pixels.rays):
-        if cancelled():
-            return None
-        bands.append(render_image(model, band, chunk=chunk).rgb)
-    seen = np.concatenate(bands)
+    if model.config.splats is not None:
+        seen = _seen(model, pixels.window)[0]
+    else:
+        bands = []
+        for band in _bands(pixels.window.rays):
+            if cancelled():
+                return None
+            bands.append(render_image(model, band, chunk=chunk).rgb)
+        seen = np.concatenate(bands)
     error = math.sqrt(float(np.mean(np.square(seen - pixels.target, dtype=np.float64))))
     return image_files.to_bytes(comparison.amplified_error(seen, pixels.target)), error
 
@@ -148,12 +163,10 @@ def view_pixels(frames: Frames, i: int, most: int) -> Pixels:
     """
     height, width = frames.cameras.height, frames.cameras.width
     stride = max(1, math.ceil(math.sqrt(height * width / most)))
-    row, column = np.meshgrid(
-        np.arange(stride // 2, height, stride), np.arange(stride // 2, width, stride), indexing="ij"
-    )
-    rays = cameras.pixel_rays(frames.cameras, np.full(row.shape, i), row, column)
-    target = image_files.read_rgb(frames.images[i])[row, column] / np.float32(255.0)
-    return Pixels(rays, target)
+    rows, columns = (np.arange(stride // 2, edge, stride) for edge in (height, width))
+    camera = frames.cameras._replace(poses=frames.cameras.poses[i : i + 1])
+    target = image_files.read_rgb(frames.images[i])[np.ix_(rows, columns)] / np.float32(255.0)
+    return Pixels(Window(camera, rows, columns), target)
 
 
 def with_indices(interfaces: Interfaces, indices: Sequence[float], rule: str) -> Interfaces:
@@ -171,6 +184,19 @@ def with_indices(interfaces: Interfaces, indices: Sequence[float], rule: str) ->
         index_outside=made.index_outside,
         index_by_channel=interfaces.index_by_channel[:0],
     )
+
+
+def _seen(
+    model: Model, window: Window
+) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
+    """Returns the colours and distances of Gaussian splats at some pixels."""
+    whole, chosen = images.render_camera(model, window.camera, 0), np.ix_(*window[1:])
+    return np.asarray(whole.rgb)[chosen], np.asarray(whole.distance)[chosen]
+
+
+def _draw_distance(model: Model, distance: Float[np.ndarray, "h w"]) -> Image:
+    # From wall to wall: hardly anything inside a bounded scene is farther.
+    return comparison.colour_distances([distance], farthest=2.0 * model.config.radius)[0]
 
 
 def _draw_surface(model: Model, layer: str, rays: Rays, most: int) -> Image:

@@ -165,7 +165,8 @@ class Page:
             remove_paths=self._scenery.remove_paths,
         )
         client.camera.on_update(lambda _: self._look())
-        client.scene.on_click()(self._click)
+        if subject.has_paths:
+            client.scene.on_click()(self._click)
         threading.Thread(target=self._work, daemon=True).start()
         self._change()
 
@@ -229,11 +230,19 @@ class Page:
             layer = layers.RGB
         if layer in layers.OF_SURFACES:
             what = ("surfaces", most)
-        rays = cameras.window_rays(view, height)
+        window = cameras.window(view, height)
         with self._turns.drawing, self._compiling(what):
-            image = layers.draw(
-                model, layer, rays, chunk=chunk, most=most, cancelled=lambda: self._stale(job)
-            )
+            if model.config.splats is not None:
+                image = layers.draw_splats(model, layer, window)
+            else:
+                image = layers.draw(
+                    model,
+                    layer,
+                    window.rays,
+                    chunk=chunk,
+                    most=most,
+                    cancelled=lambda: self._stale(job),
+                )
         if image is not None:
             self._say(_sized(image, job.stage + 1, len(self._subject.heights)))
         return image

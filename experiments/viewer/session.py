@@ -65,6 +65,11 @@ class Subject:
         return layers.offered(self.model, truth=self.frames is not None)
 
     @property
+    def has_paths(self) -> bool:
+        """Whether pixels have light paths; Gaussian splats have none."""
+        return self.model.config.splats is None
+
+    @property
     def views(self) -> Cameras | None:
         """The test cameras."""
         return None if self.frames is None else self.frames.cameras

@@ -330,33 +330,31 @@ def read_ply(path: Path) -> Gaussians:
     Harmonics may have a lower degree than 3; those above are 0. Other properties are ignored.
 
     Raises:
-      ValueError: if the file is not a binary PLY file of splats.
+      ValueError: if the file is not a binary PLY file of splats, or has a NaN.
     """
-    content = path.read_bytes()
-    header, end, data = content.partition(b"end_header\n")
-    lines = [line.split() for line in header.decode("ascii", "replace").splitlines()]
-    counts = [int(line[2]) for line in lines if line[:2] == ["element", "vertex"]]
-    names = [line[2] for line in lines if line[:2] == ["property", "float"]]
-    others = [line for line in lines if line[:1] == ["property"] and line[1:2] != ["float"]]
-    found = {name for name in names if name.startswith("f_rest_")}
-    required = {name for name in _PROPERTIES if name[:2] not in ("f_", "nx", "ny", "nz")}
-    missing = sorted((required | {"f_dc_0", "f_dc_1", "f_dc_2"}) - set(names))
-    size = 4 * len(names) * sum(counts)
-    binary = ["format", "binary_little_endian", "1.0"] in lines and bool(end)
-    if not binary or len(counts) != 1 or others or missing or len(data) < size or len(found) % 3:
+    header, end, data = path.read_bytes().partition(b"end_header\n")
+    count, names = _read_header(header)
+    wanted = ["f_dc_0", *(name for name in _PROPERTIES if name[:2] not in ("f_", "nx", "ny", "nz"))]
+    missing = [name for name in (*wanted, "f_dc_1", "f_dc_2") if name not in names]
+    found = [name for name in names if name.startswith("f_rest_")]
+    uneven = len(found) % 3 or set(found) != {f"f_rest_{n}" for n in range(len(found))}
+    size = 4 * len(names) * count
+    if not end or missing or uneven or len(set(names)) < len(names) or len(data) < size:
         raise ValueError(
             f"{path} is not a PLY file of Gaussian splats: it must be binary_little_endian, with "
             f"float properties, among them {', '.join(missing) or 'x, y, z and f_dc_0'}. Export it "
             "again."
         )
-    rows = np.frombuffer(data[:size], "<f4").reshape(counts[0], len(names)).astype(np.float32)
+    rows = np.frombuffer(data[:size], "<f4").reshape(count, len(names)).astype(np.float32)
+    if np.any(np.isnan(rows)):
+        raise ValueError(f"{path} has Gaussians with NaN in place of numbers. Export them again.")
 
     def columns(*wanted: str) -> np.ndarray:
         return rows[:, [names.index(name) for name in wanted]]
 
     each = len(found) // 3
-    rest = columns(*(f"f_rest_{n}" for n in range(len(found)))).reshape(counts[0], 3, each)
-    harmonics = np.zeros((counts[0], HARMONICS, 3), np.float32)
+    rest = columns(*(f"f_rest_{n}" for n in range(len(found)))).reshape(count, 3, each)
+    harmonics = np.zeros((count, HARMONICS, 3), np.float32)
     harmonics[:, :each] = rest.transpose(0, 2, 1)[:, :HARMONICS]
     return Gaussians(
         host_array(columns("x", "y", "z")),
@@ -366,3 +364,18 @@ def read_ply(path: Path) -> Gaussians:
         host_array(columns("f_dc_0", "f_dc_1", "f_dc_2")),
         host_array(_SIGNS.astype(np.float32)[:, None] * harmonics),
     )
+
+
+def _read_header(header: bytes) -> tuple[int, list[str]]:
+    """Returns the number of vertices and their properties; none if not all of them are floats."""
+    lines = [line.split() for line in header.decode("ascii", "replace").splitlines()]
+    lines = [line for line in lines if line[:1] not in ([], ["comment"], ["obj_info"])]
+    start = [["ply"], ["format", "binary_little_endian", "1.0"]]
+    match lines[:3], lines[3:]:
+        case [*first, ["element", "vertex", count]], properties if first == start:
+            floats = [line[2] for line in properties if len(line) == 3]
+            kinds = {tuple(line[:2]) for line in properties}
+            whole = len(floats) == len(properties) and kinds == {("property", "float")}
+            if count.isdecimal() and whole:
+                return int(count), floats
+    return 0, []

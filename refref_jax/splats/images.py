@@ -75,8 +75,14 @@ def _boxes(
 
 def count_entries(projected: Projected, grid: Grid) -> Int[Array, ""]:
     """Returns the number of entries of the lists of an image."""
-    size = _boxes(projected.means, projected.radii, grid).size
-    return jnp.sum(size[:, 0] * size[:, 1], dtype=jnp.int32)
+    return _count(_boxes(projected.means, projected.radii, grid))
+
+
+def _count(boxes: _Boxes) -> Int[Array, ""]:
+    """Returns the number of entries, or the largest integer if there are more than that."""
+    most = jnp.iinfo(jnp.int32).max
+    fits = jnp.sum(jnp.prod(boxes.size.astype(jnp.float32), axis=1)) < 0.999 * most
+    return jnp.where(fits, jnp.sum(jnp.prod(boxes.size, axis=1), dtype=jnp.int32), most)
 
 
 def make_lists(projected: Projected, grid: Grid, *, capacity: int) -> Lists:
@@ -92,7 +98,8 @@ def make_lists(projected: Projected, grid: Grid, *, capacity: int) -> Lists:
     visible = boxes.size[:, 0] > 0
     order = jnp.argsort(jnp.where(visible, projected.depths, jnp.inf), stable=True)
     order, boxes = order.astype(jnp.int32), jax.tree.map(lambda x: x[order], boxes)
-    return _listed(order, boxes, grid=grid, capacity=capacity)
+    lists = _listed(order, boxes, grid=grid, capacity=capacity)
+    return lists._replace(total=_count(boxes))
 
 
 def _sorted_lists(

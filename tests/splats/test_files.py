@@ -57,6 +57,14 @@ def test_a_file_with_fewer_harmonics_is_read(tmp_path):
         lambda content: content.replace(b"binary_little_endian", b"ascii"),
         lambda content: content.replace(b"property float opacity", b"property float opacities"),
         lambda content: content.replace(b"property float x", b"property double x"),
+        lambda content: content.replace(b"ply\n", b"plain\n", 1),
+        lambda content: content.replace(b"vertex 3", b"vertex three"),
+        lambda content: content.replace(b"vertex 3", b"vertex"),
+        lambda content: content.replace(b"vertex 3", b"vertex -3"),
+        lambda content: content.replace(b"vertex 3", b"vertex 3\nproperty float"),
+        lambda content: content.replace(b"element", b"element chunk 0\nelement"),
+        lambda content: content.replace(b"float f_rest_3\n", b"float f_rest_99\n"),
+        lambda content: content.replace(b"float nx", b"float x"),
     ],
 )
 def test_other_files_are_refused(tmp_path, change):
@@ -64,6 +72,20 @@ def test_other_files_are_refused(tmp_path, change):
     splats.write_ply(path, made_splats.gaussians(3))
     path.write_bytes(change(path.read_bytes()))
     with pytest.raises(ValueError, match=r"splats\.ply is not a PLY file of Gaussian splats"):
+        splats.read_ply(path)
+
+
+def test_comments_are_ignored(tmp_path):
+    made, path = made_splats.gaussians(3), tmp_path / "splats.ply"
+    splats.write_ply(path, made)
+    path.write_bytes(path.read_bytes().replace(b"element", b"comment of another program\nelement"))
+    np.testing.assert_array_equal(splats.read_ply(path).means, made.means)
+
+
+def test_nan_is_refused(tmp_path):
+    made, path = made_splats.gaussians(3), tmp_path / "splats.ply"
+    splats.write_ply(path, made._replace(logits=made.logits.at[1].set(np.nan)))
+    with pytest.raises(ValueError, match=r"splats\.ply has Gaussians with NaN"):
         splats.read_ply(path)
 
 

@@ -258,6 +258,15 @@ def test_lists_report_what_they_need(form):
         assert np.all(np.asarray(lists.entries) < 300)
 
 
+@pytest.mark.parametrize(
+    ("gaussians", "side", "entries"),
+    [(2, 30_000, 1_800_000_000), (3, 30_000, 2**31 - 1), (5000, 1000, 2**31 - 1)],
+)
+def test_more_entries_than_an_integer_holds_are_no_small_number(gaussians, side, entries):
+    size = jnp.full((gaussians, 2), side, jnp.int32)
+    assert int(images._count(images._Boxes(jnp.zeros_like(size), size))) == entries
+
+
 def test_both_lists_are_equal():
     found = _PROJECT(made_splats.gaussians(300), made_splats.view())
     boxes = images._boxes(found.means, found.radii, _GRID)

@@ -14,7 +14,7 @@ from refref_jax.geometry.surfaces import LevelSet, slope
 from refref_jax.optics.path_settings import PathSettings
 from refref_jax.render import checkpoint_io, images
 from refref_jax.render.model import ball_of, surface_scene
-from refref_jax.training import fit, learned_surface, loop, run_folder
+from refref_jax.training import evaluation, fit, learned_surface, loop, run_folder
 from refref_jax.training.config import TrainConfig
 from tests.factories import scenes
 from tests.processes.command import ROOT, run_command
@@ -225,3 +225,21 @@ def test_a_surface_is_learned_where_described_meshes_are_gone(tmp_path):
     resolved, _ = fit.prepare(config, report=lines.append)
     assert resolved.config.paths.max_bends == learned_surface.BENDS
     assert not any("straight" in line for line in lines if line.startswith("note"))
+
+
+@pytest.mark.slow
+def test_from_the_true_surface_it_is_as_good_as_the_oracle(tmp_path):
+    """Within 0.5 dB, over the image and inside the mask, with two bends and a clear interior."""
+    clear = {"paths": "paper", "max_bends": 2, "interior": "clear", "footprint": "cone"}
+    found = {}
+    for name, given in {
+        "oracle": clear,
+        "tnsr": {"field": "tnsr", "surface_start": "meshes"},
+    }.items():
+        config = TrainConfig().override(
+            scene=str(_SCENE), steps=300, batch=512, samples_per_ray=(16, 8), **given
+        )
+        model = fit.fit(config, report=lambda line: None)
+        found[name] = evaluation.evaluate(model, _SCENE, limit=2).results
+    for metric in ("psnr", "psnr_masked"):
+        assert found["tnsr"][metric] > found["oracle"][metric] - 0.5

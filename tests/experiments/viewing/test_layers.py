@@ -128,8 +128,12 @@ def test_an_error_is_that_of_the_pixels_that_are_drawn(model, ball_scene, monkey
     true = image_files.read_rgb(frames.images[2]) / 255.0
     np.testing.assert_allclose(pixels.target, true[1::2, 1::2], atol=1e-6)
     every = layers.view_pixels(frames, 2, 10**6)
-    np.testing.assert_array_equal(every.rays.directions, image_rays(frames.cameras, 2).directions)
-    np.testing.assert_array_equal(every.rays.directions[1::2, 1::2], pixels.rays.directions)
+    np.testing.assert_array_equal(
+        every.window.rays.directions, image_rays(frames.cameras, 2).directions
+    )
+    np.testing.assert_array_equal(
+        every.window.rays.directions[1::2, 1::2], pixels.window.rays.directions
+    )
     monkeypatch.setattr(layers.images, "TILE", 64 * 64)  # one band
     off = np.float32(0.1) * (pixels.target < 0.8)
     monkeypatch.setattr(

@@ -20,7 +20,7 @@ def test_a_browser_that_looks_along_z_sees_our_camera_turned_around():
     view = cameras.from_browser(np.array([1.0, 0, 0, 0]), np.array([1.0, 2, 3]), 0.8, 1.5)
     np.testing.assert_allclose(view.pose[:, :3], np.diag([1.0, -1.0, -1.0]), atol=1e-12)
     np.testing.assert_array_equal(view.pose[:, 3], [1.0, 2.0, 3.0])
-    middle = cameras.window_rays(view, 36).directions.reshape(-1, 3).mean(axis=0)
+    middle = cameras.window(view, 36).rays.directions.reshape(-1, 3).mean(axis=0)
     assert middle[2] > 0.9 and np.all(np.abs(middle[:2]) < 1e-6)
 
 
@@ -34,7 +34,7 @@ def test_a_pose_survives_the_browser():
 @pytest.mark.parametrize("height", [36, 90, 181])
 def test_the_picture_covers_the_window_and_what_sticks_out_is_cropped(aspect, height):
     view = _view(aspect)
-    rays = cameras.window_rays(view, height)
+    rays = cameras.window(view, height).rays
     rows, columns = rays.radii.shape
     width = cameras.width_of(height)
     assert (rows == height) if aspect <= width / height else (columns == width)
@@ -58,7 +58,7 @@ def test_the_picture_covers_the_window_and_what_sticks_out_is_cropped(aspect, he
 def test_a_square_window_on_a_square_view_has_the_view_s_own_rays():
     fov = cameras.containing_fov(_ORBIT, 1.0)
     view = Viewpoint(_ORBIT.poses[2], fov, 1.0)
-    ours, theirs = cameras.window_rays(view, 64), image_rays(_ORBIT, 2)
+    ours, theirs = cameras.window(view, 64).rays, image_rays(_ORBIT, 2)
     np.testing.assert_allclose(ours.directions, theirs.directions, atol=1e-6)
     np.testing.assert_allclose(ours.radii, theirs.radii, rtol=1e-5)
 
