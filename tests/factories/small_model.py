@@ -1,5 +1,8 @@
 """A model and a run small enough for tests, on images made from a formula."""
 
+import functools
+
+import jax
 import numpy as np
 
 from refref_jax.data.batches import PixelSampler
@@ -8,7 +11,7 @@ from refref_jax.fields.zipnerf import DensityFieldConfig, RadianceFieldConfig
 from refref_jax.geometry.cameras import orbit
 from refref_jax.optics.path_settings import PAPER
 from refref_jax.render.checkpoint_io import SavedModel
-from refref_jax.render.model import ModelConfig, ProposalConfig
+from refref_jax.render.model import ModelConfig, ProposalConfig, init_params
 from refref_jax.training.config import (
     FieldConfig,
     LossConfig,
@@ -51,6 +54,12 @@ CONFIG = TrainConfig(
 )
 
 CAMERAS = orbit(4, distance=4.0, elevation=0.3, size=16, angle_x=1.1656)
+
+
+@functools.cache
+def initial(config):
+    """Returns a model's parameters at the start of training, made once."""
+    return jax.jit(lambda: init_params(jax.random.key(0), config))()
 
 
 def sampler(seed=0):

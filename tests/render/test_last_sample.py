@@ -12,10 +12,10 @@ from refref_jax.fields import registry
 from refref_jax.fields.base import Radiance
 from refref_jax.optics.light_paths import Stop
 from refref_jax.render import pixels, volume_rendering
-from refref_jax.render.model import Params, init_params
+from refref_jax.render.model import Params
 from refref_jax.render.volume_rendering import Jitter
 from tests.factories import made_paths
-from tests.factories.small_model import MODEL
+from tests.factories.small_model import MODEL, initial
 
 _MIDDLE = dataclasses.replace(MODEL, interior="clear", last_sample="middle")
 _END = dataclasses.replace(_MIDDLE, last_sample="end")
@@ -225,16 +225,11 @@ def _brightness(config):
     return jax.jit(jax.value_and_grad(brightness, argnums=(0, 1)))
 
 
-@functools.cache
-def _initial(config):
-    return jax.jit(lambda: init_params(jax.random.key(0), config))()
-
-
 @pytest.mark.parametrize("multisamples", [1, 6])
 @pytest.mark.parametrize("distance", [0.0, 7.5, 300.0])
 def test_values_and_gradients_are_finite_wherever_the_camera_is(distance, multisamples):
     config = dataclasses.replace(_END, multisamples=multisamples)
     path = made_paths.path([], [[0, 0, 1]], [0], origin=(0.0, 0.0, distance))
-    both = _brightness(config)(_initial(config), path.points, path)
+    both = _brightness(config)(initial(config), path.points, path)
     assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(both))
     assert any(bool(jnp.any(leaf != 0.0)) for leaf in jax.tree.leaves(both[1][0].field))

@@ -22,7 +22,7 @@ from refref_jax.render.model import (
 )
 from refref_jax.render.volume_rendering import Jitter
 from tests.factories import made_paths, scenes
-from tests.factories.small_model import MODEL
+from tests.factories.small_model import MODEL, initial
 from tests.laws import gradients
 
 _PLAIN = MODEL.field
@@ -48,13 +48,8 @@ _ONE = jnp.float32(1.0)
 _radiance = jax.jit(volume_rendering.path_radiance, static_argnums=1)
 
 
-@functools.cache
-def _initial(config):
-    return jax.jit(lambda: init_params(jax.random.key(0), config))()
-
-
 def _params(config, sharpness=None):
-    params = _initial(config)
+    params = initial(config)
     if sharpness is None:
         return params
     sharper = params.field._replace(log_sharpness=jnp.log(jnp.float32(sharpness)))
@@ -218,7 +213,7 @@ def test_a_density_at_a_point_is_refused(config):
 
 
 def test_a_surface_of_a_field_without_one_is_refused():
-    params = _initial(MODEL)
+    params = initial(MODEL)
     with pytest.raises(ValueError, match=r"kind zipnerf have no surface\. Use look_up"):
         look_up_surface(params, MODEL, jnp.zeros(3), jnp.array([0.0, 0.0, 1.0]))
 
