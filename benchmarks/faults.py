@@ -126,8 +126,12 @@ class Campaign:
             self.note(fault, label, _EQUAL)
 
     def expect(self, fault: str, name: str, ended: Ended, *words: str) -> bool:
-        """Records whether a command ended in one line with some words; returns whether it did."""
-        lines = [each for each in ended.printed.splitlines() if each.startswith("error: ")]
+        """Records whether a command ended in one line with some words; returns whether it did.
+
+        A benchmark has a line for each job that failed.
+        """
+        starts = ("error: ", "failed: ")
+        lines = [each for each in ended.printed.splitlines() if each.startswith(starts)]
         found = ended.status != 0 and lines and all(word in ended.printed for word in words)
         broken = "Traceback" in ended.printed or "Fatal Python error" in ended.printed
         outcome = _TRACEBACK if broken else _REFUSED if found else _LOST

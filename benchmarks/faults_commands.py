@@ -30,7 +30,7 @@ _SOURCE = ROOT / "experiments" / "data" / "cube_smcvx_ball"
 _VIEWS, _STEP = {"train": 20, "val": 2, "test": 2}, 4
 
 # Keys of records that are measured, or that name folders or versions.
-_MEASURED = ("second", "memory", "rays_per_second", "path", "date", "took", "options", "scene")
+_MEASURED = ("second", "memory", "mib", "path", "date", "took", "options", "scene", "tables")
 
 # Files without results.
 _IGNORED = ("command.json", ".log", ".html", ".jpg", "checksums.json", "config.json", "locks")
@@ -218,12 +218,12 @@ def digest(out: Path) -> str:
 
 
 def _content(path: Path) -> bytes:
+    if path.suffix in (".md", ".csv", ".txt") or path.parent.name == "tables":
+        return b""  # tables of times
     if path.suffix in (".json", ".jsonl"):
         texts = path.read_text(encoding="utf-8").splitlines()
         records = map(json.loads, texts if path.suffix == ".jsonl" else ["\n".join(texts)])
         return json.dumps([_without_measures(each) for each in records], sort_keys=True).encode()
-    if path.suffix in (".md", ".csv", ".txt"):
-        return b""  # tables of times
     if path.suffix == ".npz":
         with np.load(path, allow_pickle=False) as arrays:
             return b"".join(name.encode() + arrays[name].tobytes() for name in sorted(arrays))
