@@ -97,7 +97,7 @@ class Few:
     Attributes:
       model: the model.
       origin: its unknowns at rest.
-      directions: how they change with each of the few.
+      directions: changes of the unknowns with each of the few.
     """
 
     def __init__(

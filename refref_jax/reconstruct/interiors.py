@@ -87,7 +87,7 @@ class Solid:
     """A part of a scene.
 
     Attributes:
-      name: what it is of.
+      name: name of its material.
       mesh: its surface.
       index: index of refraction inside.
       parent: part that contains it, or `NO_PARENT`.

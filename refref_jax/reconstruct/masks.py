@@ -299,7 +299,7 @@ def fit_profile(
     Args:
       outer: a body near the outlines, such as that of a mesh from masks.
       outlines: the outlines.
-      relief: how the body may differ from one of revolution. It gets this relief only if the
+      relief: possible difference from a body of revolution. The body gets it only if the
         outlines are explained better by it: meshes from masks have such a relief in hollows, too.
     """
     found = _fitted(outer.with_relief(None), outlines)

@@ -98,8 +98,7 @@ def make_lists(projected: Projected, grid: Grid, *, capacity: int) -> Lists:
     visible = boxes.size[:, 0] > 0
     order = jnp.argsort(jnp.where(visible, projected.depths, jnp.inf), stable=True)
     order, boxes = order.astype(jnp.int32), jax.tree.map(lambda x: x[order], boxes)
-    lists = _listed(order, boxes, grid=grid, capacity=capacity)
-    return lists._replace(total=_count(boxes))
+    return _listed(order, boxes, grid=grid, capacity=capacity)
 
 
 def _sorted_lists(
@@ -119,7 +118,7 @@ def _sorted_lists(
     tile = jnp.where(place < ends[-1], tile, grid.tiles)
     tile, owner = jax.lax.sort_key_val(tile, owner, is_stable=True)
     offsets = jnp.searchsorted(tile, jnp.arange(grid.tiles + 1, dtype=jnp.int32))
-    return Lists(order[owner], offsets.astype(jnp.int32), ends[-1])
+    return Lists(order[owner], offsets.astype(jnp.int32), _count(boxes))
 
 
 def _filled_lists(
@@ -149,7 +148,7 @@ def _filled_lists(
     # Entries past the capacity all go to one more place, which is left out.
     entries = fill(order, boxes, ends - counts, jnp.zeros(capacity + 1, jnp.int32))
     offsets = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.minimum(ends, capacity)])
-    return Lists(entries[:capacity], offsets, ends[-1])
+    return Lists(entries[:capacity], offsets, _count(boxes))
 
 
 def _over_entries(

@@ -307,7 +307,7 @@ def _round(
     Args:
       blocks: equations of the round.
       tinted: equations that tints are learned from; by default those of the round.
-      known: what is the same in all rounds.
+      known: values that are the same in all rounds.
       state: state at the start.
       count: number of iterations.
       streams: whether the next round has other equations.
@@ -379,7 +379,7 @@ def _search(
       levels: radiance at the start.
       weights: squared weight of each pixel and channel.
       seen: colours of the pixels at the start.
-      priors: what is known without the pixels.
+      priors: priors of the unknowns.
     """
     blocks, x = system.blocks, system.present(levels)
     gap = [w * (b.linear - s) for w, b, s in zip(weights, blocks, seen, strict=True)]

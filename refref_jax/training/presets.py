@@ -145,7 +145,7 @@ def override_model(
     Args:
       model: model of a preset.
       asked: overrides.
-      in_front: what is in front of a backdrop, if there is one.
+      in_front: content in front of a backdrop, if there is one.
 
     Raises:
       ValueError: if the model does not support an override.
