@@ -14,12 +14,12 @@ Colours are averaged as linear light and encoded afterwards, as a camera does.
 
 import functools
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple, TypeVar, get_args
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from refref_jax import numerics
 from refref_jax.choices import side_of
@@ -29,14 +29,14 @@ from refref_jax.geometry.cameras import Cameras, box_filter, pixel_rays, supersa
 from refref_jax.geometry.rays import Rays
 from refref_jax.geometry.surfaces import LevelSet, Surfaces, closest, meet, surface_point
 from refref_jax.numerics import host_array
-from refref_jax.optics import light_paths, path_tracing
-from refref_jax.optics.light_paths import Branch, LightPaths, reflected_first
+from refref_jax.optics import path_tracing
+from refref_jax.optics.light_paths import Branch
 from refref_jax.optics.media import EMPTY_SLOT, Scene
 from refref_jax.optics.path_settings import Detail, PathSettings
-from refref_jax.optics.path_tracing import Traced
-from refref_jax.render import learned_media, pixels
+from refref_jax.render import pixels
 from refref_jax.render.model import Model, ModelConfig, Params, path_detail
 from refref_jax.render.model import Rendering as Rendering
+from refref_jax.render.pixels import ALL, BRANCHES, TilePaths
 
 # Padding rays of a tile start at this distance and point away from the scene: they hit nothing and
 # leave the capacity of the path buffers to the other rays.
@@ -63,8 +63,6 @@ NO_PART = -1
 
 _CAST_INSTEAD = "Call it outside, or cast single rays with bvh.closest_hits."
 _INSTEAD = "Call it outside, or use render_rays, which is a pure function."
-_BRANCHES: tuple[Branch, ...] = get_args(Branch)
-_ALL, _TRANSMITTED, _REFLECTED = range(len(_BRANCHES))
 
 RAYS_OF_A_BAND = 1 << 18
 """Maximum number of rays held at once, unless one row of pixels has more."""
@@ -168,40 +166,6 @@ def crop(
     return jax.tree.map(lambda a, b: np.concatenate([a, b]), (part, within), (filling, nowhere))
 
 
-class _Tile(NamedTuple):
-    """The paths of a tile, with the selected paths first.
-
-    Attributes:
-      paths: light paths.
-      heaviest: whether a path is the heaviest of its ray.
-      count: number of selected paths.
-      dropped: dropped throughput of each ray.
-    """
-
-    paths: LightPaths
-    heaviest: Bool[Array, " paths"]
-    count: Int[Array, ""]  # type: ignore[assignment]  # hides tuple.count
-    dropped: Float[Array, "rays 3"]
-
-
-def render_rays(model: Model, rays: Rays) -> Rendering:
-    """Renders rays in one piece: a pure function, to be jitted or differentiated by the caller.
-
-    A trained model is in single precision, and so are its renderings.
-
-    Args:
-      model: trained model.
-      rays: camera rays `[n]`. They share the path buffers, so with few rays, throughput is dropped
-        sooner.
-    """
-    rays = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), rays)
-    detail = path_detail(model.config, model.settings)
-    traced = path_tracing.trace(model.scene, rays, settings=model.settings, detail=detail)
-    tile = _sort(traced, traced.dropped.shape[0])
-    sums = _blank(tile.dropped)
-    return _finish(_add(model.params, tile.paths, tile.heaviest, sums, config=model.config))
-
-
 def render_image(
     model: Model, rays: Rays, *, chunk: int | None = None, branch: Branch = "both"
 ) -> Rendering:
@@ -222,13 +186,13 @@ def render_image(
       ValueError: if `chunk` is less than 1, or `branch` is unknown.
       TypeError: if it is called in a function that JAX transforms.
     """
-    if branch not in _BRANCHES:
-        raise ValueError(f"branch is {branch!r}, unknown. Use one of {', '.join(_BRANCHES)}.")
+    if branch not in BRANCHES:
+        raise ValueError(f"branch is {branch!r}, unknown. Use one of {', '.join(BRANCHES)}.")
     chunk = on_this_device(CHUNK) if chunk is None else chunk
     if chunk < 1:
         raise ValueError(f"chunk is {chunk}, but a chunk needs paths. Give 1 or more.")
     rays = jax.tree.map(np.float32, fetch(rays, instead=_INSTEAD))
-    nothing = jax.device_get(_blank(jax.device_put(np.zeros((0, 3), np.float32))))
+    nothing = jax.device_get(pixels.blank(jax.device_put(np.zeros((0, 3), np.float32))))
     return in_tiles(
         lambda tile, _, real: _render_tile(model, tile, real, chunk, branch),
         rays,
@@ -240,9 +204,9 @@ def render_image(
 
 def _render_tile(model: Model, rays: Rays, real: int, chunk: int, branch: Branch) -> Rendering:
     detail = path_detail(model.config, model.settings)
-    which = _BRANCHES.index(branch)
+    which = BRANCHES.index(branch)
     tile = _trace_tile(model.scene, rays, real, which, settings=model.settings, detail=detail)
-    sums = _blank(tile.dropped)
+    sums = pixels.blank(tile.dropped)
     count = int(fetch(tile.count, instead=_INSTEAD))
     if model.config.backdrop is not None:  # every chunk builds its mipmap
         chunk = tile.paths.radii.size
@@ -251,31 +215,24 @@ def _render_tile(model: Model, rays: Rays, real: int, chunk: int, branch: Branch
     return _finish_tile(sums)
 
 
-def _blank(dropped: Float[Array, "rays 3"]) -> Rendering:
-    """Returns the initial rendering, before any path is added."""
-    black = jnp.zeros_like(dropped)
-    zeros = black[:, 0]
-    return Rendering(black, zeros, zeros, zeros, linear=black, dropped=dropped)
-
-
 @functools.partial(jax.jit, static_argnames=("settings", "detail"))
 def _trace_tile(
     scene: Scene,
     rays: Rays,
     real: Int[Array, ""],
-    which: int | Int[Array, ""] = _ALL,
+    which: int | Int[Array, ""] = ALL,
     *,
     settings: PathSettings,
     detail: Detail,
-) -> _Tile:
+) -> TilePaths:
     traced = path_tracing.trace(scene, rays, settings=settings, detail=detail)
-    return _sort(traced, real, which)
+    return pixels.sort_paths(traced, real, which=which)
 
 
 @functools.partial(jax.jit, static_argnames=("config", "chunk"))
 def _render_chunk(
     params: Params,
-    tile: _Tile,
+    tile: TilePaths,
     sums: Rendering,
     start: Int[Array, ""],
     *,
@@ -288,61 +245,12 @@ def _render_chunk(
     paths = jax.tree.map(lambda x: x[held], tile.paths)
     real = index < tile.count
     paths = paths._replace(throughput=jnp.where(real[:, None], paths.throughput, 0.0))
-    return _add(params, paths, tile.heaviest[held] & real, sums, config=config)
+    return pixels.add_paths(params, paths, tile.heaviest[held] & real, sums, config=config)
 
 
 @jax.jit
 def _finish_tile(sums: Rendering) -> Rendering:
-    return _finish(sums)
-
-
-def _sort(traced: Traced, real: int | Int[Array, ""], which: int | Int[Array, ""] = _ALL) -> _Tile:
-    """Moves the selected paths to the front and marks the heaviest path of each ray.
-
-    Args:
-      traced: traced paths of a tile.
-      real: number of rays in the tile that are not padding.
-      which: index of the selected branch in `_BRANCHES`.
-    """
-    paths, rays = traced.paths, traced.dropped.shape[0]
-    branch = jnp.where(reflected_first(paths), _REFLECTED, _TRANSMITTED)
-    exists = light_paths.exists(paths) & (paths.rays < real)
-    exists &= (which == _ALL) | (which == branch)
-    order = jnp.argsort(~exists, stable=True)
-    throughput = jnp.mean(paths.throughput, axis=-1)
-    most = jax.ops.segment_max(throughput, paths.rays, num_segments=rays)
-    heaviest = exists & (throughput >= most[paths.rays])
-    sorted_paths = jax.tree.map(lambda x: x[order], paths)
-    return _Tile(sorted_paths, heaviest[order], jnp.sum(exists), traced.dropped)
-
-
-def _add(
-    params: Params,
-    paths: LightPaths,
-    heaviest: Bool[Array, " paths"],
-    sums: Rendering,
-    *,
-    config: ModelConfig,
-) -> Rendering:
-    """Adds some paths to the linear colours and distances of their rays."""
-    jitter = pixels.no_jitter(config, paths.radii.shape[0])
-    one = jnp.ones((), paths.radii.dtype)
-    seen = pixels.render_paths(params, config, paths, jitter, anneal=one).composite
-    paths = learned_media.attenuate(params.tints, paths, radius=config.radius)
-    share = jnp.mean(paths.throughput, axis=-1)
-    rays = sums.distance.shape[0]
-    # Writes to an index past the end are dropped.
-    target = jnp.where(heaviest, paths.rays, rays)
-    return sums._replace(
-        linear=sums.linear.at[paths.rays].add(paths.throughput * seen.rgb),
-        distance=sums.distance.at[target].set(seen.median, mode="drop"),
-        mean_distance=sums.mean_distance.at[target].set(seen.mean, mode="drop"),
-        accumulation=sums.accumulation.at[paths.rays].add(share * seen.accumulation),
-    )
-
-
-def _finish(sums: Rendering) -> Rendering:
-    return sums._replace(rgb=jnp.clip(pixels.linear_to_srgb(sums.linear), 0.0, 1.0))
+    return pixels.finish(sums)
 
 
 def render_camera(

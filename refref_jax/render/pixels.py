@@ -15,11 +15,11 @@ multisamples of intervals.
 
 import functools
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax.fields import registry
 from refref_jax.fields.base import Radiance
@@ -27,7 +27,8 @@ from refref_jax.geometry.cameras import Cameras, image_rays
 from refref_jax.geometry.rays import Rays
 from refref_jax.numerics import host_array
 from refref_jax.optics import light_paths, path_tracing
-from refref_jax.optics.light_paths import LightPaths, PathStatus
+from refref_jax.optics.light_paths import Branch, LightPaths, PathStatus, reflected_first
+from refref_jax.optics.path_tracing import Traced
 from refref_jax.render import backdrop, learned_media, volume_rendering
 from refref_jax.render.model import (
     Model,
@@ -44,6 +45,10 @@ from refref_jax.sampling import scene_bounds
 # Thresholds between the linear and the power segment of the transfer function.
 _LINEAR_KNEE = 0.0031308
 _SRGB_KNEE = 0.04045
+
+BRANCHES: tuple[Branch, ...] = get_args(Branch)
+"""Selections of paths by their branch at the first surface; `ALL` is the index of the first."""
+ALL, _TRANSMITTED, _REFLECTED = range(len(BRANCHES))
 
 
 class Light(NamedTuple):
@@ -163,6 +168,99 @@ def _see_backdrop(params: Params, config: ModelConfig, paths: LightPaths) -> Com
         median=distance,
         mean=distance,
     )
+
+
+class TilePaths(NamedTuple):
+    """The paths of a tile, with the selected paths first.
+
+    Attributes:
+      paths: light paths.
+      heaviest: whether a path is the heaviest of its ray.
+      count: number of selected paths.
+      dropped: dropped throughput of each ray.
+    """
+
+    paths: LightPaths
+    heaviest: Bool[Array, " paths"]
+    count: Int[Array, ""]  # type: ignore[assignment]  # hides tuple.count
+    dropped: Float[Array, "rays 3"]
+
+
+def render_rays(model: Model, rays: Rays) -> Rendering:
+    """Renders rays in one piece: a pure function, to be jitted or differentiated by the caller.
+
+    A trained model is in single precision, and so are its renderings.
+
+    Args:
+      model: trained model.
+      rays: camera rays `[n]`. They share the path buffers, so with few rays, throughput is dropped
+        sooner.
+    """
+    rays = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), rays)
+    detail = path_detail(model.config, model.settings)
+    traced = path_tracing.trace(model.scene, rays, settings=model.settings, detail=detail)
+    tile = sort_paths(traced, traced.dropped.shape[0])
+    sums = blank(tile.dropped)
+    return finish(add_paths(model.params, tile.paths, tile.heaviest, sums, config=model.config))
+
+
+def blank(dropped: Float[Array, "rays 3"]) -> Rendering:
+    """Returns the initial rendering, before any path is added."""
+    black = jnp.zeros_like(dropped)
+    zeros = black[:, 0]
+    return Rendering(black, zeros, zeros, zeros, linear=black, dropped=dropped)
+
+
+def sort_paths(
+    traced: Traced, real: int | Int[Array, ""], *, which: int | Int[Array, ""] = ALL
+) -> TilePaths:
+    """Moves the selected paths to the front and marks the heaviest path of each ray.
+
+    Args:
+      traced: traced paths of a tile.
+      real: number of rays in the tile that are not padding.
+      which: index of the selected branch in `BRANCHES`.
+    """
+    paths, rays = traced.paths, traced.dropped.shape[0]
+    branch = jnp.where(reflected_first(paths), _REFLECTED, _TRANSMITTED)
+    exists = light_paths.exists(paths) & (paths.rays < real)
+    exists &= (which == ALL) | (which == branch)
+    order = jnp.argsort(~exists, stable=True)
+    throughput = jnp.mean(paths.throughput, axis=-1)
+    most = jax.ops.segment_max(throughput, paths.rays, num_segments=rays)
+    heaviest = exists & (throughput >= most[paths.rays])
+    sorted_paths = jax.tree.map(lambda x: x[order], paths)
+    return TilePaths(sorted_paths, heaviest[order], jnp.sum(exists), traced.dropped)
+
+
+def add_paths(
+    params: Params,
+    paths: LightPaths,
+    heaviest: Bool[Array, " paths"],
+    sums: Rendering,
+    *,
+    config: ModelConfig,
+) -> Rendering:
+    """Adds some paths to the linear colours and distances of their rays."""
+    jitter = no_jitter(config, paths.radii.shape[0])
+    one = jnp.ones((), paths.radii.dtype)
+    seen = render_paths(params, config, paths, jitter, anneal=one).composite
+    paths = learned_media.attenuate(params.tints, paths, radius=config.radius)
+    share = jnp.mean(paths.throughput, axis=-1)
+    rays = sums.distance.shape[0]
+    # Writes to an index past the end are dropped.
+    target = jnp.where(heaviest, paths.rays, rays)
+    return sums._replace(
+        linear=sums.linear.at[paths.rays].add(paths.throughput * seen.rgb),
+        distance=sums.distance.at[target].set(seen.median, mode="drop"),
+        mean_distance=sums.mean_distance.at[target].set(seen.mean, mode="drop"),
+        accumulation=sums.accumulation.at[paths.rays].add(share * seen.accumulation),
+    )
+
+
+def finish(sums: Rendering) -> Rendering:
+    """Returns a rendering whose linear colours are complete, with their sRGB."""
+    return sums._replace(rgb=jnp.clip(linear_to_srgb(sums.linear), 0.0, 1.0))
 
 
 def random_jitter(key: Array, config: ModelConfig, slots: Int[Array, " paths"]) -> Jitter:
