@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax import numerics
 from refref_jax.choices import side_of
@@ -32,11 +32,12 @@ from refref_jax.numerics import host_array
 from refref_jax.optics import path_tracing
 from refref_jax.optics.light_paths import Branch
 from refref_jax.optics.media import EMPTY_SLOT, Scene
-from refref_jax.optics.path_settings import Detail, PathSettings
-from refref_jax.render import pixels
-from refref_jax.render.model import Model, ModelConfig, Params, path_detail
+from refref_jax.optics.path_settings import STRAIGHT, Detail, PathSettings
+from refref_jax.render import backdrop, learned_media, pixels
+from refref_jax.render.backdrop import Mips
+from refref_jax.render.model import Model, ModelConfig, Params, is_backdrop, path_detail, surface_of
 from refref_jax.render.model import Rendering as Rendering
-from refref_jax.render.pixels import ALL, BRANCHES, TilePaths
+from refref_jax.render.pixels import ALL, BRANCHES, BackdropEnds, TilePaths
 
 # Padding rays of a tile start at this distance and point away from the scene: they hit nothing and
 # leave the capacity of the path buffers to the other rays.
@@ -56,13 +57,16 @@ CHUNK = 4096
 # An accelerator takes as many times the rays and paths, since the host waits for each tile.
 _TIMES = 16
 
-CAST_TILE = 65536
-"""Number of rays cast at once."""
-
 NO_PART = -1
 
 _CAST_INSTEAD = "Call it outside, or cast single rays with bvh.closest_hits."
 _INSTEAD = "Call it outside, or use render_rays, which is a pure function."
+
+backdrop_ends = jax.jit(
+    pixels.backdrop_ends,
+    static_argnames=("settings", "domain", "resolution", "most_taps", "axes", "tally", "fields"),
+)
+mipmap = jax.jit(backdrop.mipmap, static_argnames="space")
 
 RAYS_OF_A_BAND = 1 << 18
 """Maximum number of rays held at once, unless one row of pixels has more."""
@@ -192,6 +196,8 @@ def render_image(
     if chunk < 1:
         raise ValueError(f"chunk is {chunk}, but a chunk needs paths. Give 1 or more.")
     rays = jax.tree.map(np.float32, fetch(rays, instead=_INSTEAD))
+    if is_backdrop(model.config) and branch == "both":
+        return _render_backdrop(model, rays)
     nothing = jax.device_get(pixels.blank(jax.device_put(np.zeros((0, 3), np.float32))))
     return in_tiles(
         lambda tile, _, real: _render_tile(model, tile, real, chunk, branch),
@@ -199,6 +205,75 @@ def render_image(
         tile=tile_for(max(rays.radii.size, TILE)),
         nothing=nothing,
         instead=_INSTEAD,
+    )
+
+
+def _render_backdrop(model: Model, rays: Rays) -> Rendering:
+    """Renders rays in front of a backdrop; those that meet no object are straight."""
+    shape, config = model.config.backdrop, model.config
+    assert shape is not None
+    params, scene = jax.device_put((model.params, model.scene))
+    mips = mipmap(surface_of(params), config.space)
+    look = functools.partial(
+        backdrop_ends,
+        scene,
+        domain=config.domain,
+        resolution=shape.resolution,
+        most_taps=shape.most_taps,
+        axes=shape.axes,
+        tally=path_detail(config, model.settings).tally,
+        fields=(),
+        faint=0.0,
+    )
+    met = np.isfinite(find_first_surface(scene.surfaces, rays).distances)
+
+    def render(chosen: Bool[np.ndarray, "*rays"], settings: PathSettings) -> Rendering:
+        return in_tiles(
+            lambda tile, *_: _of_backdrop(params, mips, *look(tile, settings=settings)),
+            jax.tree.map(lambda x: host_array(x[chosen]), rays),
+            tile=tile_for(max(rays.radii.size, TILE)),
+            nothing=jax.device_get(pixels.blank(jax.device_put(np.zeros((0, 3), np.float32)))),
+            instead=_INSTEAD,
+        )
+
+    def merged(some: np.ndarray, others: np.ndarray) -> np.ndarray:
+        whole = np.empty((*met.shape, *some.shape[1:]), some.dtype)
+        whole[met], whole[~met] = some, others
+        return whole
+
+    return jax.tree.map(merged, render(met, model.settings), render(~met, STRAIGHT))
+
+
+@jax.jit
+def _of_backdrop(
+    params: Params, mips: Mips, ends: BackdropEnds, dropped: Float[Array, "rays 3"]
+) -> Rendering:
+    """Renders rays in front of a backdrop.
+
+    Args:
+      params: parameters of the model.
+      mips: radiance of the backdrop at all resolutions.
+      ends: ends of the light paths.
+      dropped: dropped throughput of each ray.
+    """
+    lookups, count = ends.lookups, dropped.shape[0]
+    share = jnp.mean(lookups.throughput, axis=-1)
+    most = jax.ops.segment_max(share, lookups.pixels, num_segments=count)
+    heaviest = (ends.distances > 0.0) & (share >= most[lookups.pixels])
+    if params.tints is not None:
+        left = learned_media.transmittance(params.tints, ends.crossings)
+        lookups = lookups._replace(throughput=lookups.throughput * left)
+    sums = pixels.blank(dropped)
+    target = jnp.where(heaviest, lookups.pixels, count)
+    distance = sums.distance.at[target].set(ends.distances, mode="drop")
+    share = jnp.mean(lookups.throughput, axis=-1)
+    return pixels.finish(
+        sums._replace(
+            distance=distance,
+            mean_distance=distance,
+            accumulation=sums.accumulation.at[lookups.pixels].add(share),
+            linear=backdrop.colours(mips, lookups, pixels=count),
+        )
     )
 
 
@@ -296,7 +371,8 @@ def render_camera(
 
 def warm_up(model: Model, cameras: Cameras, *, rays_per_pixel: int, chunk: int | None) -> None:
     """Compiles all programs of `render_camera`, so that later timings are of rendering alone."""
-    if runs_on_cpu() and model.config.splats is None:  # one tile size serves all images
+    on_cpu = runs_on_cpu() and model.config.splats is None
+    if on_cpu and not is_backdrop(model.config):  # one tile size serves all images
         render_image(model, pixel_rays(cameras, *np.zeros((3, 1), np.int64)), chunk=chunk)
     else:
         render_camera(model, cameras, 0, rays_per_pixel=rays_per_pixel, chunk=chunk)
@@ -354,18 +430,19 @@ class FirstSurface(NamedTuple):
 
 
 def find_first_surface(
-    surfaces: Surfaces | LevelSet, rays: Rays, *, tile: int = CAST_TILE
+    surfaces: Surfaces | LevelSet, rays: Rays, *, tile: int | None = None
 ) -> FirstSurface:
     """Casts rays and returns the first surface of each.
 
     Args:
       surfaces: surfaces of the scene.
       rays: rays with any leading axes, usually `[height, width]`, and unit directions.
-      tile: number of rays cast at once.
+      tile: number of rays cast at once, by default 16,384, and 262,144 off CPUs.
 
     Raises:
       ValueError: if `tile` is less than 1.
     """
+    tile = on_this_device(TILE) if tile is None else tile
     if tile < 1:
         raise ValueError(f"tile is {tile}, but a tile needs rays. Give 1 or more.")
     surfaces = jax.device_put(surfaces)

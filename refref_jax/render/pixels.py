@@ -28,8 +28,11 @@ from refref_jax.geometry.rays import Rays
 from refref_jax.numerics import host_array
 from refref_jax.optics import light_paths, path_tracing
 from refref_jax.optics.light_paths import Branch, LightPaths, PathStatus, reflected_first
+from refref_jax.optics.media import Scene
+from refref_jax.optics.path_settings import Detail, PathSettings, Tally
 from refref_jax.optics.path_tracing import Traced
 from refref_jax.render import backdrop, learned_media, volume_rendering
+from refref_jax.render.backdrop import Lookups
 from refref_jax.render.model import (
     Model,
     ModelConfig,
@@ -41,6 +44,7 @@ from refref_jax.render.model import (
 )
 from refref_jax.render.volume_rendering import Composite, Histogram, Jitter, PathRadiance
 from refref_jax.sampling import scene_bounds
+from refref_jax.sampling.scene_bounds import Domain
 
 # Thresholds between the linear and the power segment of the transfer function.
 _LINEAR_KNEE = 0.0031308
@@ -261,6 +265,80 @@ def add_paths(
 def finish(sums: Rendering) -> Rendering:
     """Returns a rendering whose linear colours are complete, with their sRGB."""
     return sums._replace(rgb=jnp.clip(linear_to_srgb(sums.linear), 0.0, 1.0))
+
+
+class BackdropEnds(NamedTuple):
+    """Where the light paths of rays end on a backdrop.
+
+    Attributes:
+      lookups: points of the backdrop; their pixels are the indices of the rays.
+      crossings: what learned tints read of the paths (`learned_media.crossings`).
+      hidden: whether a path meets something in front of the backdrop.
+      distances: arc length of each path up to the backdrop, world units; 0 in empty slots.
+    """
+
+    lookups: Lookups
+    crossings: Float[Array, "paths unknowns"]
+    hidden: Bool[Array, " paths"]
+    distances: Float[Array, " paths"]
+
+
+def backdrop_ends(
+    scene: Scene,
+    rays: Rays,
+    *,
+    settings: PathSettings,
+    domain: Domain,
+    resolution: int,
+    most_taps: int,
+    axes: int,
+    tally: Tally,
+    fields: tuple[int, ...],
+    faint: float | Float[Array, ""],
+) -> tuple[BackdropEnds, Float[Array, "rays 3"]]:
+    """Traces rays up to a backdrop.
+
+    Args:
+      scene: the scene.
+      rays: camera rays.
+      settings: path settings.
+      domain: scene bounds; their `space` is the kind of the backdrop.
+      resolution: number of cells per side of a face.
+      most_taps: largest number of taps along each axis of a ray's footprint.
+      axes: number of axes of the direction that the radiance depends on, 0 or 3.
+      tally: `parts` if tints and absorption are learned.
+      fields: parts whose inside is a field, which hides what is behind it.
+      faint: throughput below which a path has only one tap (`backdrop.locate`).
+
+    Returns:
+      The ends of the light paths, and the dropped throughput of each ray.
+    """
+    parts = scene.interfaces.index_inside.shape[0]
+    unknowns = 2 * parts if tally == "parts" else 0
+    if (unknowns or fields) and settings.max_bends:
+        # The first and the last segment are the fewest that can be stored.
+        detail = Detail("outside", 2, "differential", "parts")
+        traced = path_tracing.trace(scene, rays, settings=settings, detail=detail)
+        paths, ends = traced.paths, light_paths.ends_of(traced.paths)
+        crossings = learned_media.crossings(paths, radius=domain.radius)[:, :unknowns]
+        hidden = jnp.any(paths.path_lengths[:, jnp.asarray(fields, jnp.int32)] > 0.0, axis=1)
+        dropped = traced.dropped
+    else:
+        found = path_tracing.trace_ends(scene, rays, settings=settings, footprint="differential")
+        ends, dropped = found.ends, found.dropped
+        crossings = jnp.zeros((ends.rays.shape[0], unknowns), ends.tau.dtype)
+        hidden = jnp.zeros(ends.rays.shape, bool)
+    if ends.stop is not None:
+        hidden |= jnp.isfinite(ends.stop.tau)
+    exists = light_paths.exists(ends)
+    ends = ends._replace(throughput=jnp.where(exists[:, None], ends.throughput, 0.0))
+    locate = functools.partial(
+        backdrop.locate, resolution=resolution, most_taps=most_taps, axes=axes, faint=faint
+    )
+    lookups = locate(domain, ends, ends.rays)
+    leave = jax.vmap(functools.partial(scene_bounds.exit_distance, domain))
+    distances = jnp.where(exists, ends.tau + leave(ends.origins, ends.directions), 0.0)
+    return BackdropEnds(lookups, crossings, hidden, distances), dropped
 
 
 def random_jitter(key: Array, config: ModelConfig, slots: Int[Array, " paths"]) -> Jitter:
