@@ -148,14 +148,11 @@ def read(
             met = np.isfinite(images.find_first_surface(scene.surfaces, rays).distances)
             for which, bends in ((kept & ~met, STRAIGHT), (kept & met, settings)):
                 chosen = jax.tree.map(lambda x, which=which: host_array(x[which]), rays)
-                each += _in_tiles(
-                    functools.partial(look, settings=bends), chosen, place[names[which]], tile
-                )
+                bent = functools.partial(look, settings=bends)
+                each += _in_tiles(bent, chosen, place[names[which]], tile, side**2)
             for _ in some:
                 progress(next(done), len(photographs))
         joined = jax.tree.map(lambda *parts: np.concatenate(parts), *each)
-        lookups = joined.lookups._replace(throughput=joined.lookups.throughput / side**2)
-        joined = joined._replace(lookups=lookups)
         block = _block(joined, photographs[views], views, drawn)
         if not np.any(joined.hidden):
             return block
@@ -164,6 +161,14 @@ def read(
 
     split = np.array_split(np.arange(len(photographs)), min(blocks, len(photographs)))
     return tuple(jax.device_put(block) for block in at_once(trace, split))
+
+
+def warm_up(levels: Pyramid, space: Space) -> None:
+    """Compiles what no pixel decides: the radiance at all resolutions, and its transpose.
+
+    XLA compiles a program on one core, so that this takes no time beside `read`.
+    """
+    jax.block_until_ready(_mipmap_transposed(images.mipmap(levels, space), space))
 
 
 def meets(scene: Scene, cameras: Cameras) -> Bool[np.ndarray, "views h w"]:
@@ -187,6 +192,7 @@ def _in_tiles(
     rays: Rays,
     names: Int[np.ndarray, " rays"],
     tile: int,
+    rays_per_pixel: int,
 ) -> Iterator[BackdropEnds]:
     """Yields where the paths of rays end, tile by tile.
 
@@ -195,6 +201,7 @@ def _in_tiles(
       rays: camera rays.
       names: pixel of each ray.
       tile: number of rays per tile.
+      rays_per_pixel: number of rays in each pixel, which share its light.
     """
     for first in range(0, names.size, tile):
         part, _ = images.crop(rays, None, first, tile)
@@ -203,7 +210,9 @@ def _in_tiles(
         real = (seen.lookups.taps[:, 0] > 0) & (seen.lookups.pixels < names.size - first)
         seen = jax.tree.map(lambda x, real=real: x[real], seen)
         pixel = names[first + seen.lookups.pixels].astype(np.int32)
-        yield seen._replace(lookups=seen.lookups._replace(pixels=pixel))
+        throughput = seen.lookups.throughput / rays_per_pixel
+        lookups = seen.lookups._replace(pixels=pixel, throughput=throughput)
+        yield seen._replace(lookups=lookups)
 
 
 def at_once(function: Callable[..., _Result], *each: Sequence[Any]) -> list[_Result]:
