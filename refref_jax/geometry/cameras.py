@@ -8,7 +8,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Real
 
 from refref_jax.choices import ORIGIN, Position
 from refref_jax.geometry.rays import Rays
@@ -40,10 +40,10 @@ def focal_length(width: int, angle_x: float) -> float:
 def pixel_rays(
     cameras: Cameras,
     camera: Int[np.ndarray, "*shape"],
-    row: Int[np.ndarray, "*shape"],
-    column: Int[np.ndarray, "*shape"],
+    row: Real[np.ndarray, "*shape"],
+    column: Real[np.ndarray, "*shape"],
 ) -> Rays:
-    """Returns the rays through pixel centres, in single precision.
+    """Returns the rays through pixel centres, or places beside them, in single precision.
 
     The radius of a ray is that of a cone with the solid angle of the pixel, scaled so that a disc
     of this radius has the variance of the pixel (mip-NeRF: `2 / sqrt(12)` of its width).
@@ -51,8 +51,8 @@ def pixel_rays(
     Args:
       cameras: the cameras.
       camera: index of the camera of each ray.
-      row: pixel row, 0 at the top.
-      column: pixel column, 0 at the left.
+      row: pixel row, 0 at the top; half a pixel more is its lower edge.
+      column: pixel column, 0 at the left; half a pixel more is its right edge.
     """
     towards, cosine = _unit_directions(cameras, row, column)
     pose = cameras.poses[camera]
@@ -216,7 +216,7 @@ def rays_of_views(
 
 
 def planar_directions(
-    cameras: Cameras, row: Int[np.ndarray, "*shape"], column: Int[np.ndarray, "*shape"]
+    cameras: Cameras, row: Real[np.ndarray, "*shape"], column: Real[np.ndarray, "*shape"]
 ) -> Float[np.ndarray, "*shape 3"]:
     """Returns directions to pixel centres in the camera frame, with unit depth."""
     x = (column + 0.5 - 0.5 * cameras.width) / cameras.focal
@@ -225,7 +225,7 @@ def planar_directions(
 
 
 def _unit_directions(
-    cameras: Cameras, row: Int[np.ndarray, "*shape"], column: Int[np.ndarray, "*shape"]
+    cameras: Cameras, row: Real[np.ndarray, "*shape"], column: Real[np.ndarray, "*shape"]
 ) -> tuple[Float[np.ndarray, "*shape 3"], Float[np.ndarray, "*shape"]]:
     """Returns unit directions in the camera frame, and their cosine with the optical axis."""
     planar = planar_directions(cameras, row, column)

@@ -28,12 +28,15 @@ from refref_jax.geometry.rays import Rays
 from refref_jax.optics import light_paths, path_tracing
 from refref_jax.optics.light_paths import LightPaths, PathEnds
 from refref_jax.optics.media import Scene
-from refref_jax.optics.path_settings import PathSettings
+from refref_jax.optics.path_settings import STRAIGHT, PathSettings
 from refref_jax.render import images, pixels
 from refref_jax.render.backgrounds import Radiance
 
 TILE = 65536
-"""Number of rays traced at once."""
+"""Largest number of rays traced at once."""
+
+# Number of tiles of an image whose rays all meet an object, if they are small enough.
+_TILES = 4
 
 _INSTEAD = (
     "Call it outside, or use trace or follow_main_branches and shade, which are pure functions."
@@ -55,7 +58,7 @@ class KnownRendering(NamedTuple):
       paths: number of light paths of each ray.
       dropped: dropped throughput of each ray, because a path buffer was full or truncated paths are
         black.
-      casts: total number of closest-hit queries.
+      casts: total number of closest-hit queries; what tells which rays to trace is not counted.
     """
 
     rgb: Float[np.ndarray, "*rays 3"]
@@ -104,6 +107,8 @@ def render_known(
 ) -> KnownRendering:
     """Renders any number of rays in front of a known background; 0 rays give an empty rendering.
 
+    Rays that meet no object are straight, and are not traced, unless `interior_list` is given.
+
     Args:
       scene: the scene.
       radiance: function of origin and direction that returns the background's linear RGB.
@@ -111,8 +116,8 @@ def render_known(
       settings: path settings.
       interior_list: interior list of each ray's origin, where rays carry one (see
         `media.interior_length` and `data.mesh_queries.parts_around`); none by default.
-      tile: number of rays traced at once. Lower it if memory runs out. The rays of a tile share the
-        path buffers, so with few rays, throughput is dropped sooner.
+      tile: largest number of rays traced at once. Lower it if memory runs out. The rays of a tile
+        share the path buffers, so with few rays, throughput is dropped sooner.
 
     Raises:
       ValueError: if `tile` is less than 1, the radiance function does not return three numbers, or
@@ -133,10 +138,31 @@ def render_known(
     """
     if tile < 1:
         raise ValueError(f"tile is {tile}, but a tile needs rays. Give 1 or more.")
-    count = rays.radii.size
-    tile = images.size_for(count, most=tile)
+    # Of all rays of an image, a part meets glass; this size is the same for all images of a size.
+    tile = images.size_for(-(-rays.radii.size // _TILES), most=tile)
     # Transferred to the device once, not once per tile.
     scene, radiance = jax.device_put((scene, _as_argument(radiance)))
+    render = functools.partial(_in_tiles, scene, radiance, tile=tile)
+    if interior_list is not None or settings.max_bends == 0:
+        return render(rays, interior_list, settings=settings)
+    rays = images.fetch(rays, instead=_INSTEAD)
+    met, hits, misses = images.split_by_hit(scene.surfaces, rays, tile=tile)
+    bent, straight = render(hits, None, settings=settings), render(misses, None, settings=STRAIGHT)
+    pairs = zip(bent[:-1], straight[:-1], strict=True)
+    rgb, linear, paths, dropped = (images.merged(met, *each) for each in pairs)
+    return KnownRendering(rgb, linear, paths, dropped, bent.casts + misses.radii.size)
+
+
+def _in_tiles(
+    scene: Scene,
+    radiance: Radiance,
+    rays: Rays,
+    interior_list: Int[np.ndarray, "*rays slots"] | None,
+    *,
+    settings: PathSettings,
+    tile: int,
+) -> KnownRendering:
+    """Renders rays tile by tile; arguments as in `render_known`."""
     casts = []
 
     def see(
@@ -302,9 +328,17 @@ def _rays_of_pixels(
     column: Int[np.ndarray, "*pixels"],
     side: int,
 ) -> Rays:
-    """Returns the `side * side` rays of some pixels, as `[*pixels, rays]`, row by row."""
+    """Returns the `side * side` rays of some pixels, as `[*pixels, rays]`, row by row.
+
+    Every square of a pixel has one ray, and so have all `side * side` rows and columns of the
+    pixel: an edge along them is resolved by as many steps as there are rays.
+
+    Source: Kensler, Correlated Multi-Jittered Sampling (2013), the canonical arrangement.
+    """
     down, along = (x.ravel() for x in np.indices((side, side)))
-    fine_row, fine_column = side * row[..., None] + down, side * column[..., None] + along
+    lower, further = 0.5 - (along + 0.5) / side, (down + 0.5) / side - 0.5
+    fine_row = side * row[..., None] + down + lower
+    fine_column = side * column[..., None] + along + further
     fine = pinholes.supersample(cameras, side)
     rays = pinholes.pixel_rays(fine, np.full(fine_row.shape, view), fine_row, fine_column)
     pixel = np.broadcast_to((row * cameras.width + column)[..., None], fine_row.shape)

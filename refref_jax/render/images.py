@@ -225,37 +225,48 @@ def _render_backdrop(model: Model, rays: Rays) -> Rendering:
         fields=(),
         faint=0.0,
     )
-    met = np.isfinite(find_first_surface(scene.surfaces, rays).distances)
 
-    def render(chosen: Bool[np.ndarray, "*rays"], settings: PathSettings) -> Rendering:
+    def render(some: Rays, settings: PathSettings) -> Rendering:
         return in_tiles(
             lambda tile, *_: _of_backdrop(params, mips, *look(tile, settings=settings)),
-            jax.tree.map(lambda x: host_array(x[chosen]), rays),
+            some,
             tile=tile_for(max(rays.radii.size, TILE)),
             nothing=jax.device_get(pixels.blank(jax.device_put(np.zeros((0, 3), np.float32)))),
             instead=_INSTEAD,
         )
 
-    def merged(some: np.ndarray, others: np.ndarray) -> np.ndarray:
-        whole = np.empty((*met.shape, *some.shape[1:]), some.dtype)
-        whole[met], whole[~met] = some, others
-        return whole
+    met, hits, misses = split_by_hit(scene.surfaces, rays)
+    seen = render(hits, model.settings), render(misses, STRAIGHT)
+    return jax.tree.map(functools.partial(merged, met), *seen)
 
-    return jax.tree.map(merged, render(met, model.settings), render(~met, STRAIGHT))
+
+def split_by_hit(
+    surfaces: Surfaces | LevelSet, rays: Rays, *, tile: int | None = None
+) -> tuple[Bool[np.ndarray, "*rays"], Rays, Rays]:
+    """Splits rays, as NumPy arrays, into those that meet an object and those that do not.
+
+    Returns:
+      Which rays meet an object, these rays, and the others; `merged` joins their values.
+    """
+    met = np.isfinite(find_first_surface(surfaces, rays, tile=tile).distances)
+    hits, misses = (
+        jax.tree.map(lambda x, some=some: host_array(x[some]), rays) for some in (met, ~met)
+    )
+    return met, hits, misses
+
+
+def merged(met: np.ndarray, some: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Returns values of all rays from those of the rays that meet an object, and of the others."""
+    whole = np.empty((*met.shape, *some.shape[1:]), some.dtype)
+    whole[met], whole[~met] = some, others
+    return whole
 
 
 @jax.jit
 def _of_backdrop(
     params: Params, mips: Mips, ends: BackdropEnds, dropped: Float[Array, "rays 3"]
 ) -> Rendering:
-    """Renders rays in front of a backdrop.
-
-    Args:
-      params: parameters of the model.
-      mips: radiance of the backdrop at all resolutions.
-      ends: ends of the light paths.
-      dropped: dropped throughput of each ray.
-    """
+    """Renders rays in front of a backdrop, given its mipmap and the ends of their paths."""
     lookups, count = ends.lookups, dropped.shape[0]
     share = jnp.mean(lookups.throughput, axis=-1)
     most = jax.ops.segment_max(share, lookups.pixels, num_segments=count)

@@ -202,9 +202,16 @@ _CAMERA = cameras.orbit(2, distance=4.0, elevation=0.3, size=12, angle_x=0.9)
 _TILE = 576
 
 
+def _rays(side, view=0):
+    """Returns the rays of an image: one in each square, row and column of a pixel."""
+    fine = cameras.supersample(_CAMERA, side)
+    row, column = np.indices((fine.height, fine.width))
+    up, right = (column % side + 0.5) / side - 0.5, (row % side + 0.5) / side - 0.5
+    return cameras.pixel_rays(fine, np.full(row.shape, view), row - up, column + right)
+
+
 def _uniform(scene, radiance, side, view=0):
-    rays = cameras.image_rays(cameras.supersample(_CAMERA, side), view)
-    seen = render_known(scene, radiance, rays, settings=TREE, tile=_TILE)
+    seen = render_known(scene, radiance, _rays(side, view), settings=TREE, tile=_TILE)
     return cameras.box_filter(seen.linear, side), seen.casts
 
 
@@ -222,14 +229,31 @@ def test_a_pixel_is_the_mean_of_its_rays(scene, view):
     assert seen.casts == casts and np.all(seen.rays == 4) and np.all(seen.dropped == 0.0)
 
 
+@pytest.mark.parametrize("side", [2, 4, 8])
+def test_an_edge_along_the_pixels_is_resolved_by_as_many_steps_as_there_are_rays(side):
+    ahead = cameras.Cameras(np.eye(4, dtype=np.float32)[None, :3], 1, 1, 1.0)
+    empty = refref_jax.assemble([])
+    shares = np.linspace(-0.4, 0.4, 23)
+
+    def half(edge, axis, origin, direction):
+        return jnp.full(3, jnp.where(direction[axis] > edge * -direction[2], 1.0, 0.0))
+
+    for axis in (0, 1):
+        for share in shares:
+            sky = jax.tree_util.Partial(half, jnp.float32(share), jnp.int32(axis))
+            seen = render_known_camera(
+                empty, sky, ahead, 0, settings=STRAIGHT, rays_per_pixel=side**2, tile=1024
+            )
+            assert abs(seen.linear[0, 0, 0] - (0.5 - share)) <= 0.5 / side**2 + 1e-6
+
+
 def _stripes(origin, direction):
     return jnp.where(jnp.sin(4.0 * direction[2]) > 0.0, 0.9, 0.1) + 0.0 * origin
 
 
 def test_pixels_whose_rays_differ_from_neighbours_get_more_rays(scene):
     seen = _image(scene, _stripes, refined_rays_per_pixel=25, tolerance=0.2)
-    rays = cameras.image_rays(cameras.supersample(_CAMERA, 2), 0)
-    first = render_known(scene, _stripes, rays, settings=TREE, tile=_TILE).rgb
+    first = render_known(scene, _stripes, _rays(2), settings=TREE, tile=_TILE).rgb
     high, low = (f(first, (3, 3, 1), mode="nearest") for f in (maximum_filter, minimum_filter))
     contrast = (high - low).reshape(12, 2, 12, 2, 3).max(axis=(1, 3, 4))
     clear = np.abs(contrast - 0.2) > 1e-5  # of rounding
