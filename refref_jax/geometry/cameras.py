@@ -143,6 +143,19 @@ def box_filter(
     return blocks.mean(axis=(1, 3))
 
 
+def lower_median(pixels: Float[np.ndarray, "height width"], side: int) -> Float[np.ndarray, "h w"]:
+    """Returns the median of each pixel's subpixels, the lower of two middle values.
+
+    Args:
+      pixels: image of a supersampled camera.
+      side: subpixels along each edge of a pixel, as in `supersample`.
+    """
+    height, width = pixels.shape
+    blocks = pixels.reshape(height // side, side, width // side, side).swapaxes(1, 2)
+    ordered = np.sort(blocks.reshape(*blocks.shape[:2], side**2), axis=-1)
+    return ordered[..., (side**2 - 1) // 2]
+
+
 def orbit(
     frames: int,
     *,

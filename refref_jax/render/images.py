@@ -25,6 +25,7 @@ from refref_jax import numerics
 from refref_jax.choices import side_of
 from refref_jax.compilation import runs_on_cpu
 from refref_jax.geometry import bvh
+from refref_jax.geometry import cameras as pinholes
 from refref_jax.geometry.cameras import Cameras, box_filter, pixel_rays, supersample
 from refref_jax.geometry.rays import Rays
 from refref_jax.geometry.surfaces import LevelSet, Surfaces, closest, meet, surface_point
@@ -54,6 +55,8 @@ TILE = 16384
 CHUNK = 4096
 """Number of paths rendered at once on a CPU; see `on_this_device`."""
 
+_FEWEST = 16  # parts of a tile below which it is not halved again
+
 # An accelerator takes as many times the rays and paths, since the host waits for each tile.
 _TIMES = 16
 
@@ -67,6 +70,7 @@ backdrop_ends = jax.jit(
     static_argnames=("settings", "domain", "resolution", "most_taps", "axes", "tally", "fields"),
 )
 mipmap = jax.jit(backdrop.mipmap, static_argnames="space")
+_finish = jax.jit(pixels.finish)
 
 RAYS_OF_A_BAND = 1 << 18
 """Maximum number of rays held at once, unless one row of pixels has more."""
@@ -97,15 +101,36 @@ def in_tiles(
     """
     rays, interior_list = fetch((rays, interior_list), instead=instead)
     shape, count = rays.radii.shape, rays.radii.size
-    flat, listed = jax.tree.map(
-        lambda x: x.reshape(-1, *x.shape[len(shape) :]), (rays, interior_list)
-    )
-    parts = []
-    for start in range(0, count, tile):
-        seen = see(*crop(flat, listed, start, tile), min(tile, count - start))
-        parts.append(fetch(seen, instead=instead))
+    ends = len(shape)
+    flat, listed = jax.tree.map(lambda x: x.reshape(-1, *x.shape[ends:]), (rays, interior_list))
+    parts = [
+        _see_tile(see, *crop(flat, listed, start, tile), min(tile, count - start), instead)
+        for start in range(0, count, tile)
+    ]
     joined = join(parts or [nothing])
     return jax.tree.map(lambda x: x[:count].reshape((*shape, *x.shape[1:])), joined)
+
+
+def _see_tile(
+    see: Callable[..., Any], rays: Rays, listed: np.ndarray | None, real: int, instead: str
+) -> Any:
+    """Renders a tile; in halves, if light was dropped because its paths did not fit the buffers."""
+    seen = fetch(see(rays, listed, real), instead=instead)
+    lost, tile, half = np.sum(getattr(seen, "dropped", 0.0)), rays.radii.size, -(-real // 2)
+    if not lost or real <= tile // _FEWEST:
+        return seen
+    first, second = (
+        _see_tile(see, *crop(*_of((rays, listed), part), 0, tile), count, instead)
+        for part, count in ((slice(half), half), (slice(half, real), real - half))
+    )
+    whole = join([_of(first, slice(half)), _of(second, slice(tile - half))])
+    # Truncated paths that are black are dropped, too: fewer rays at once do not help.
+    return whole if np.sum(whole.dropped) < lost else seen
+
+
+def _of(tree: _Tree, which: Any) -> _Tree:
+    """Returns some of the values of all arrays of a pytree."""
+    return jax.tree.map(lambda x: host_array(x[which]), tree)
 
 
 def on_this_device(size: int) -> int:
@@ -196,9 +221,9 @@ def render_image(
     if chunk < 1:
         raise ValueError(f"chunk is {chunk}, but a chunk needs paths. Give 1 or more.")
     rays = jax.tree.map(np.float32, fetch(rays, instead=_INSTEAD))
-    if is_backdrop(model.config) and branch == "both":
-        return _render_backdrop(model, rays)
     nothing = jax.device_get(pixels.blank(jax.device_put(np.zeros((0, 3), np.float32))))
+    if is_backdrop(model.config) and branch == "both":
+        return _render_backdrop(model, rays, nothing)
     return in_tiles(
         lambda tile, _, real: _render_tile(model, tile, real, chunk, branch),
         rays,
@@ -208,7 +233,7 @@ def render_image(
     )
 
 
-def _render_backdrop(model: Model, rays: Rays) -> Rendering:
+def _render_backdrop(model: Model, rays: Rays, nothing: Rendering) -> Rendering:
     """Renders rays in front of a backdrop; those that meet no object are straight."""
     shape, config = model.config.backdrop, model.config
     assert shape is not None
@@ -231,7 +256,7 @@ def _render_backdrop(model: Model, rays: Rays) -> Rendering:
             lambda tile, *_: _of_backdrop(params, mips, *look(tile, settings=settings)),
             some,
             tile=tile_for(max(rays.radii.size, TILE)),
-            nothing=jax.device_get(pixels.blank(jax.device_put(np.zeros((0, 3), np.float32)))),
+            nothing=nothing,
             instead=_INSTEAD,
         )
 
@@ -243,16 +268,9 @@ def _render_backdrop(model: Model, rays: Rays) -> Rendering:
 def split_by_hit(
     surfaces: Surfaces | LevelSet, rays: Rays, *, tile: int | None = None
 ) -> tuple[Bool[np.ndarray, "*rays"], Rays, Rays]:
-    """Splits rays, as NumPy arrays, into those that meet an object and those that do not.
-
-    Returns:
-      Which rays meet an object, these rays, and the others; `merged` joins their values.
-    """
+    """Returns which rays meet an object, these rays and the others; `merged` joins their values."""
     met = np.isfinite(find_first_surface(surfaces, rays, tile=tile).distances)
-    hits, misses = (
-        jax.tree.map(lambda x, some=some: host_array(x[some]), rays) for some in (met, ~met)
-    )
-    return met, hits, misses
+    return met, _of(rays, met), _of(rays, ~met)
 
 
 def merged(met: np.ndarray, some: np.ndarray, others: np.ndarray) -> np.ndarray:
@@ -298,7 +316,7 @@ def _render_tile(model: Model, rays: Rays, real: int, chunk: int, branch: Branch
         chunk = tile.paths.radii.size
     for start in range(0, count, chunk):
         sums = _render_chunk(model.params, tile, sums, start, config=model.config, chunk=chunk)
-    return _finish_tile(sums)
+    return _finish(sums)
 
 
 @functools.partial(jax.jit, static_argnames=("settings", "detail"))
@@ -332,11 +350,6 @@ def _render_chunk(
     real = index < tile.count
     paths = paths._replace(throughput=jnp.where(real[:, None], paths.throughput, 0.0))
     return pixels.add_paths(params, paths, tile.heaviest[held] & real, sums, config=config)
-
-
-@jax.jit
-def _finish_tile(sums: Rendering) -> Rendering:
-    return pixels.finish(sums)
 
 
 def render_camera(
@@ -392,10 +405,8 @@ def warm_up(model: Model, cameras: Cameras, *, rays_per_pixel: int, chunk: int |
 def average(fine: Rendering, side: int) -> Rendering:
     """Averages the small pixels of a supersampled camera.
 
-    Colours are averaged as linear light, without clipping, and then encoded and clipped; mean
-    distances and accumulations are averaged as they are. The distance is the median over the small
-    pixels, or the lower of the two middle values if their number is even. At an edge it is thus the
-    distance of one of the two surfaces, never one between them.
+    Colours are averaged as linear light, and then encoded and clipped. The distance is the lower
+    median: at an edge it is that of one of the two surfaces, never one between them.
     """
 
     def filtered(values: Array | np.ndarray) -> Any:
@@ -404,19 +415,12 @@ def average(fine: Rendering, side: int) -> Rendering:
     linear = filtered(fine.linear)
     return Rendering(
         rgb=np.clip(jax.device_get(pixels.linear_to_srgb(jax.device_put(linear))), 0.0, 1.0),
-        distance=host_array(_lower_median(np.asarray(fine.distance), side)),
+        distance=host_array(pinholes.lower_median(np.asarray(fine.distance), side)),
         mean_distance=filtered(fine.mean_distance),
         accumulation=filtered(fine.accumulation),
         linear=linear,
         dropped=filtered(fine.dropped),
     )
-
-
-def _lower_median(fine: Float[np.ndarray, "height width"], side: int) -> Float[np.ndarray, "h w"]:
-    height, width = fine.shape
-    blocks = fine.reshape(height // side, side, width // side, side).swapaxes(1, 2)
-    ordered = np.sort(blocks.reshape(*blocks.shape[:2], side**2), axis=-1)
-    return ordered[..., (side**2 - 1) // 2]
 
 
 def _bands(cameras: Cameras, view: int, *, rows: int) -> Iterator[Rays]:

@@ -11,9 +11,11 @@ from benchmarks.oracles import colours
 from refref_jax.data.mesh_queries import parts_around
 from refref_jax.geometry import cameras
 from refref_jax.geometry.rays import Rays
+from refref_jax.optics import path_tracing
 from refref_jax.optics.path_settings import PAPER, STRAIGHT, TREE
 from refref_jax.render import (
     background_rendering,
+    images,
     radiance_of,
     render_known,
     render_known_camera,
@@ -282,10 +284,36 @@ def test_white_is_not_refined_and_zero_tolerance_refines_what_differs(scene):
     np.testing.assert_allclose(seen.linear, _uniform(scene, _environment(), 3)[0], atol=1e-5)
 
 
+def test_pixels_that_show_the_background_alone_may_have_more_rays(scene):
+    seen = _image(scene, _stripes, background_rays_per_pixel=25, refined_rays_per_pixel=9)
+    hits = np.isfinite(images.find_first_surface(scene.surfaces, _rays(2)).distances)
+    near = maximum_filter(hits.reshape(12, 2, 12, 2).any(axis=(1, 3)), 3, mode="constant")
+    assert 0.1 < near.mean() < 0.9
+    np.testing.assert_array_equal(seen.rays == 25, ~near)
+    assert set(np.unique(seen.rays)) == {4, 9, 25}
+    by_count = [_uniform(scene, _stripes, side)[0] for side in (2, 3, 5)]
+    expected = np.select([seen.rays[..., None] == count for count in (4, 9, 25)], by_count)
+    np.testing.assert_allclose(seen.linear, expected, atol=1e-5)
+
+
+def test_a_tile_whose_paths_do_not_fit_is_rendered_in_halves(scene, rays):
+    scarce = dataclasses.replace(TREE, live_per_ray=1.0, segments_per_ray=6.0, paths_per_ray=2.0)
+    met = np.isfinite(images.find_first_surface(scene.surfaces, rays).distances)
+    hits = jax.tree.map(lambda x: np.resize(x[met], (1024, *x.shape[rays.radii.ndim :])), rays)
+    once = path_tracing.trace_ends(scene, hits, settings=scarce)
+    assert np.sum(once.dropped) > 0.0
+    seen = render_known(scene, _environment(), hits, settings=scarce, tile=1024)
+    assert np.sum(seen.dropped) == 0.0
+    roomy = render_known(scene, _environment(), hits, settings=TREE, tile=1024)
+    np.testing.assert_allclose(seen.linear, roomy.linear, atol=1e-5)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"rays_per_pixel": 5}, "square grid"),
+        ({"background_rays_per_pixel": 5}, "square grid"),
+        ({"background_rays_per_pixel": 4}, "background_rays_per_pixel is 4"),
         ({"refined_rays_per_pixel": 5}, "square grid"),
         ({"rays_per_pixel": 9, "refined_rays_per_pixel": 9}, "refined_rays_per_pixel is 9"),
         ({"rays_per_pixel": 9, "refined_rays_per_pixel": 4}, "refined_rays_per_pixel is 4"),
