@@ -113,9 +113,9 @@ def test_a_run_is_resumed_with_its_scene_where_it_is_now_and_all_is_reported(
 
     monkeypatch.setattr(fit, "train", train)
     before, now = tmp_path / "before", tmp_path / "now"
-    shutil.copytree(ROOT / "experiments" / "data" / "cube_smcvx_ball", before)
+    small_scenes.write_scene(before)
     lines = []
-    config = TrainConfig().override(scene=before, steps=3)
+    config = TrainConfig().override(scene=before, steps=3, batch=64)
     fit.train_into(tmp_path / "run", config, report=lines.append)
     before.rename(now)
     moved = config.override(scene=now)
