@@ -15,7 +15,7 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="refref_jax_tests_")
     atexit.register(shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
-os.environ["XLA_FLAGS"] = code_generator.faster(os.environ.get("XLA_FLAGS", ""))
+os.environ.update(code_generator.faster())
 
 import jax
 import pytest
@@ -32,9 +32,10 @@ def pytest_collection_modifyitems(items):
 
 
 def pytest_configure(config):
-    # Of commands; `_compiled_lightly` is for the suite's own processes.
+    # Of commands, and XLA's flags, which are read with the first array. `_compiled_lightly` is for
+    # the suite's own processes.
     if _is_quick(config):
-        os.environ[code_generator.LIGHTLY] = "1"
+        os.environ.update(code_generator.lighter())
 
 
 def _is_quick(config):

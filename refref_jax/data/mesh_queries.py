@@ -310,10 +310,10 @@ def is_convex(part: MeshPart) -> bool:
         return False
     if not np.isclose(volume(part.vertices, part.faces), hull.volume, rtol=_VOLUME_TOLERANCE):
         return False
-    corners = part.vertices[faces]
-    points = np.concatenate([corners.reshape(-1, 3), corners.mean(axis=1)])
+    others = part.vertices[np.setdiff1d(faces, hull.vertices)]
+    points = np.concatenate([others, part.vertices[faces].mean(axis=1)])
     tolerance = float(TOLERANCE * np.linalg.norm(np.ptp(part.vertices, axis=0)))
-    return _lie_on(hull, np.unique(points, axis=0), tolerance)
+    return _lie_on(hull, points, tolerance)
 
 
 def encloses(outer: MeshPart, inner: MeshPart) -> bool:

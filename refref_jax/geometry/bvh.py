@@ -27,7 +27,6 @@ negative leaf.
 Source: the slab method, Kay and Kajiya (1986).
 """
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -252,27 +251,27 @@ def closest_hits(
     )
     nodes = bvh.nodes.reshape(-1, WORDS)
     limits = jnp.where(_finite(origins) & _finite(directions), limits, -1.0)
-    distances, primitive_ids = jax.lax.platform_dependent(
-        nodes,
-        bvh.facets,
-        origins,
-        directions,
-        limits,
-        exclude_primitive,
-        **_traversals(),
+    distances, primitive_ids = _traverse(
+        nodes, bvh.facets, origins, directions, limits, exclude_primitive
     )
     return _finish(bvh, origins, directions, distances, primitive_ids)
 
 
-def _traversals() -> dict[str, Callable[..., Any]]:
-    """Returns the traversal of each kind of device that has one of its own, and the default."""
+def _traverse(*arguments: Array) -> tuple[Float[Array, " rays"], Int[Array, " rays"]]:
+    """Traverses the tree as the kind of device that it is compiled for does it best."""
     from refref_jax.geometry import traversal  # which reads the nodes of this module
 
-    usual = jax.vmap(traversal.trace_ray, in_axes=(None, None, 0, 0, 0, 0))
     if compilation.chosen_traversal() == "warp":
         warp = traversal.trace_in_warp
-        return {"cpu": warp, "cuda": warp, "default": usual}
-    return {"cpu": _closest_in_packets, "default": usual}
+        return jax.lax.platform_dependent(*arguments, cpu=warp, cuda=warp, default=_closest_by_ray)
+    return _as_platform_likes(*arguments)
+
+
+def _closest_by_ray(*arguments: Array) -> tuple[Float[Array, " rays"], Int[Array, " rays"]]:
+    """Traces all rays, each by itself."""
+    from refref_jax.geometry import traversal  # which reads the nodes of this module
+
+    return jax.vmap(traversal.trace_ray, in_axes=(None, None, 0, 0, 0, 0))(*arguments)
 
 
 def _finite(vectors: Float[Array, "rays 3"]) -> Bool[Array, " rays"]:
@@ -337,6 +336,11 @@ def _closest_in_packets(
         ),
     )
     return jax.tree.map(lambda x: x.reshape(-1)[:count], tuple(closest))
+
+
+_as_platform_likes = compilation.chosen_by_platform(
+    "closest_hits", cpu=_closest_in_packets, default=_closest_by_ray, like=lambda *query: query[4:]
+)
 
 
 class _Query(NamedTuple):

@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
@@ -112,7 +111,7 @@ def load_model(run: str | os.PathLike[str], *, step: int | None = None) -> Model
         params = restore(manager, step, {PARAMS_ITEM: shapes})[PARAMS_ITEM]
     # Restored arrays are committed to a device, and so are all results computed from them. The
     # initial sums of an image are not, so their chunk would be compiled separately.
-    unbound = jax.tree.map(jnp.asarray, jax.device_get(params))
+    unbound = jax.device_put(jax.device_get(params))
     learned = Params(*unbound)
     if bends_light(saved.config):
         return Model(saved.config, saved.settings, surface_scene(learned, saved.config), learned)
@@ -289,7 +288,7 @@ def load_scene(run: Path) -> Scene:
             f"{path} cannot be read ({_brief(error)}). Restore it, or train again into another "
             "folder."
         ) from error
-    return jax.tree.map(jax.numpy.asarray, Scene(surfaces, interfaces))
+    return jax.device_put(Scene(surfaces, interfaces))
 
 
 def _empty_arrays(parts: int) -> dict[str, np.ndarray]:

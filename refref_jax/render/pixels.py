@@ -407,7 +407,7 @@ def render_splats(model: Model, cameras: Cameras, view: int, *, side: int = 1) -
             "Splats with splat_filter=classic are thinner in smaller pixels, so that several rays "
             "per pixel would show others than were trained. Use 1 ray per pixel."
         )
-    rays = jax.tree.map(jnp.asarray, image_rays(cameras, view))
+    rays = jax.device_put(image_rays(cameras, view))
     exits = jax.vmap(functools.partial(scene_bounds.exit_distance, config.domain))
     flat = exits(rays.origins.reshape(-1, 3), rays.directions.reshape(-1, 3))
     beyond = jax.device_get(jnp.where(jnp.isfinite(flat), flat, config.far))

@@ -366,7 +366,7 @@ def set_up(
     The light paths of all pixels are kept if the run uses them more than once and they take at most
     half a gibibyte; while they are concatenated, three times that is in use.
     """
-    scene = jax.tree.map(jnp.asarray, scene)
+    scene = jax.device_put(scene)
     if bends_light(model):  # paths through the surface are traced within the steps
         settings = STRAIGHT
     found = survey_paths(scene, sampler.survey(_SURVEY).rays, settings=settings)

@@ -3,7 +3,6 @@
 import functools
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import trimesh
 
@@ -32,7 +31,7 @@ def right_prism(index=1.5):
 def build(*parts, rule="nested"):
     tree = find_containment(parts)
     built = assemble_scene(parts, tree.parents, rule=rule, overlaps=tree.overlaps)
-    return jax.tree.map(jnp.asarray, built)
+    return jax.device_put(built)
 
 
 @functools.cache

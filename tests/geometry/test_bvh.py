@@ -312,6 +312,16 @@ def test_a_coordinate_that_is_not_finite_is_an_error():
         bvh_build.build(triangles)
 
 
+def test_only_the_traversal_of_the_platform_is_traced(monkeypatch):
+    monkeypatch.setattr(traversal, "trace_ray", lambda *_: pytest.fail("the other one"))
+    tree, _ = bvh_build.build(np.asarray(_soup(3), np.float32))
+    rays = [jnp.ones((7, 3)), jnp.ones((7, 3)), jnp.ones(7), jnp.ones(7, jnp.int32)]
+    program = _trace.trace(jax.tree.map(jnp.asarray, tree), *rays)
+    program.lower(lowering_platforms=("cpu",))
+    with pytest.raises(pytest.fail.Exception):
+        program.lower(lowering_platforms=("cuda",))
+
+
 def test_the_traversal_is_compiled_as_one_native_loop_on_cpu():
     if jax.default_backend() != "cpu":
         pytest.skip("the native loop is for the CPU")

@@ -17,6 +17,7 @@ from refref_jax.render.images import render_image
 from refref_jax.training import fit, run_folder
 from refref_jax.training.config import TrainConfig
 from tests.factories import small_scenes
+from tests.factories.cut_ball import cut_ball
 from tests.processes.command import ROOT
 
 pytestmark = [pytest.mark.loose, pytest.mark.longest]
@@ -113,7 +114,7 @@ def test_a_run_is_resumed_with_its_scene_where_it_is_now_and_all_is_reported(
 
     monkeypatch.setattr(fit, "train", train)
     before, now = tmp_path / "before", tmp_path / "now"
-    shutil.copytree(ROOT / "experiments" / "data" / "cube_smcvx_ball", before)
+    cut_ball(before)
     lines = []
     config = TrainConfig().override(scene=before, steps=3)
     fit.train_into(tmp_path / "run", config, report=lines.append)
