@@ -194,7 +194,6 @@ def render_known_camera(
     rays_per_pixel: int = 4,
     refined_rays_per_pixel: int | None = None,
     tolerance: float = 0.1,
-    background_rays_per_pixel: int | None = None,
     interior_list: Int[np.ndarray, " slots"] | None = None,
     tile: int = TILE,
 ) -> KnownImage:
@@ -216,16 +215,12 @@ def render_known_camera(
         every pixel has `rays_per_pixel` by default.
       tolerance: difference between the largest and the smallest sRGB value in `[0, 1]` of
         neighbouring rays, in the worst channel, up to which a pixel is not refined.
-      background_rays_per_pixel: number of rays in pixels that show nothing but the background, a
-        larger square; these rays are straight and cost little. None of their first rays, nor of the
-        next pixels', meets an object, and `interior_list` must not be given.
       interior_list: interior list of the camera's position, see `render_known`.
       tile: number of rays traced at once, see `render_known`.
 
     Raises:
-      ValueError: if a number of rays is not a square, those of some pixels are not more than those
-        of all, the tolerance is negative, an interior list is given with rays of the background, or
-        `render_known` rejects its arguments.
+      ValueError: if a number of rays is not a square, the refined number is not larger, the
+        tolerance is negative, or `render_known` rejects its arguments.
       TypeError: if it is called in a function that JAX transforms.
 
     Example:
@@ -242,14 +237,11 @@ def render_known_camera(
       >>> image.rgb.shape, sorted(set(image.rays.ravel().tolist()))
       ((8, 8, 3), [4, 16])
     """
-    _check_numbers(rays_per_pixel, refined_rays_per_pixel, background_rays_per_pixel, tolerance)
-    if background_rays_per_pixel is not None and interior_list is not None:
-        raise ValueError("Rays from inside an object bend. Leave out background_rays_per_pixel.")
+    _check_refinement(rays_per_pixel, refined_rays_per_pixel, tolerance)
     scene, radiance = jax.device_put((scene, _as_argument(radiance)))
-    row, column = np.indices((cameras.height, cameras.width))
 
-    def see(where: np.ndarray, count: int, settings: PathSettings) -> KnownRendering:
-        rays = _rays_of_pixels(cameras, view, row[where], column[where], side_of(count))
+    def see(row: np.ndarray, column: np.ndarray, count: int) -> KnownRendering:
+        rays = _rays_of_pixels(cameras, view, row, column, side_of(count))
         listed = interior_list
         if listed is not None:
             listed = np.broadcast_to(listed, (*rays.radii.shape, *listed.shape))
@@ -257,23 +249,15 @@ def render_known_camera(
             scene, radiance, rays, settings=settings, interior_list=listed, tile=tile
         )
 
-    seen = see(np.full(row.shape, True), rays_per_pixel, settings)
+    row, column = np.indices((cameras.height, cameras.width))
+    seen = see(row, column, rays_per_pixel)
     casts, rays = seen.casts, np.full(row.shape, rays_per_pixel, np.int32)
-    linear, dropped = seen.linear.mean(axis=1), seen.dropped.mean(axis=1)
-    linear, dropped = linear.reshape(*row.shape, 3), dropped.reshape(*row.shape, 3)
-    clear, again = np.full((2, *row.shape), False)
-    if background_rays_per_pixel is not None:
-        clear = _shows_background(scene, cameras, view, rays_per_pixel)
+    linear, dropped = seen.linear.mean(axis=2), seen.dropped.mean(axis=2)
     if refined_rays_per_pixel is not None:
-        again = ~clear & (_contrast(seen.rgb.reshape(*row.shape, -1, 3)) > tolerance)
-    for where, count, bends in (
-        (clear, background_rays_per_pixel, STRAIGHT),
-        (again, refined_rays_per_pixel, settings),
-    ):
-        if count is not None:
-            finer = see(where, count, bends)
-            casts, rays[where] = casts + finer.casts, count
-            linear[where], dropped[where] = finer.linear.mean(axis=1), finer.dropped.mean(axis=1)
+        again = _contrast(seen.rgb) > tolerance
+        finer = see(row[again], column[again], refined_rays_per_pixel)
+        casts, rays[again] = casts + finer.casts, refined_rays_per_pixel
+        linear[again], dropped[again] = finer.linear.mean(axis=1), finer.dropped.mean(axis=1)
     rgb = np.clip(np.asarray(pixels.linear_to_srgb(jax.device_put(linear))), 0.0, 1.0)
     return KnownImage(rgb, linear, rays, dropped, casts)
 
@@ -327,31 +311,17 @@ def _as_argument(radiance: Radiance) -> Radiance:
     return jax.tree_util.Partial(radiance) if plain else radiance
 
 
-def _check_numbers(
-    count: int, refined: int | None, background: int | None, tolerance: float
-) -> None:
-    for number in (count, refined, background):
+def _check_refinement(count: int, refined: int | None, tolerance: float) -> None:
+    for number in (count, refined):
         if number is not None:
             side_of(number)
     if not tolerance >= 0.0:
         raise ValueError(f"tolerance is {tolerance}. Give 0 or more.")
-    for name, number in (("refined", refined), ("background", background)):
-        if number is not None and not count < number:
-            raise ValueError(
-                f"{name}_rays_per_pixel is {number}, not more than rays_per_pixel, {count}. Give a "
-                "larger square, or None."
-            )
-
-
-def _shows_background(
-    scene: Scene, cameras: Cameras, view: int, rays_per_pixel: int
-) -> Bool[np.ndarray, "h w"]:
-    """Returns which pixels have no ray that meets an object, and no neighbour that has one."""
-    row, column = np.indices((cameras.height, cameras.width))
-    rays = _rays_of_pixels(cameras, view, row, column, side_of(rays_per_pixel))
-    met = np.isfinite(images.find_first_surface(scene.surfaces, rays).distances).any(axis=2)
-    around = np.lib.stride_tricks.sliding_window_view(np.pad(met, 1), (3, 3))
-    return np.logical_not(around.any(axis=(2, 3)))
+    if refined is not None and not count < refined:
+        raise ValueError(
+            f"refined_rays_per_pixel is {refined}, not more than rays_per_pixel, {count}. Give a "
+            "larger square, or None."
+        )
 
 
 def _rays_of_pixels(

@@ -284,18 +284,6 @@ def test_white_is_not_refined_and_zero_tolerance_refines_what_differs(scene):
     np.testing.assert_allclose(seen.linear, _uniform(scene, _environment(), 3)[0], atol=1e-5)
 
 
-def test_pixels_that_show_the_background_alone_may_have_more_rays(scene):
-    seen = _image(scene, _stripes, background_rays_per_pixel=25, refined_rays_per_pixel=9)
-    hits = np.isfinite(images.find_first_surface(scene.surfaces, _rays(2)).distances)
-    near = maximum_filter(hits.reshape(12, 2, 12, 2).any(axis=(1, 3)), 3, mode="constant")
-    assert 0.1 < near.mean() < 0.9
-    np.testing.assert_array_equal(seen.rays == 25, ~near)
-    assert set(np.unique(seen.rays)) == {4, 9, 25}
-    by_count = [_uniform(scene, _stripes, side)[0] for side in (2, 3, 5)]
-    expected = np.select([seen.rays[..., None] == count for count in (4, 9, 25)], by_count)
-    np.testing.assert_allclose(seen.linear, expected, atol=1e-5)
-
-
 def test_a_tile_whose_paths_do_not_fit_is_rendered_in_halves(scene, rays):
     scarce = dataclasses.replace(TREE, live_per_ray=1.0, segments_per_ray=6.0, paths_per_ray=2.0)
     met = np.isfinite(images.find_first_surface(scene.surfaces, rays).distances)
@@ -312,8 +300,6 @@ def test_a_tile_whose_paths_do_not_fit_is_rendered_in_halves(scene, rays):
     ("options", "message"),
     [
         ({"rays_per_pixel": 5}, "square grid"),
-        ({"background_rays_per_pixel": 5}, "square grid"),
-        ({"background_rays_per_pixel": 4}, "background_rays_per_pixel is 4"),
         ({"refined_rays_per_pixel": 5}, "square grid"),
         ({"rays_per_pixel": 9, "refined_rays_per_pixel": 9}, "refined_rays_per_pixel is 9"),
         ({"rays_per_pixel": 9, "refined_rays_per_pixel": 4}, "refined_rays_per_pixel is 4"),
