@@ -60,8 +60,8 @@ _ROUNDS = flags.DEFINE_integer("rounds", 2, "Timed renderings of every image.")
 
 _SAMPLES = (16, 64, 256, 1024)
 _UNIFORM = (1, 4, 9, 16)
-# First rays, refined rays, and tolerance.
-_ADAPTIVE = ((1, 4, 0.1), (1, 16, 0.1), (4, 16, 0.1), (4, 36, 0.1), (9, 64, 0.1))
+# First rays, refined rays, tolerance, and rays where only the background is seen.
+_ADAPTIVE = ((1, 4, 0.1, 9), (4, 16, 0.1, 36), (4, 36, 0.1, 144), (9, 64, 0.1, 256))
 _FINE = dataclasses.replace(TREE, min_throughput=0.005, max_bends=32)
 _NOISE = "noise of the truth"
 _REFINED = "tree, refined"
@@ -180,8 +180,8 @@ class Ours:
         return np.isfinite(images.find_first_surface(self.scene.surfaces, rays).distances)
 
     def __call__(self, view: View, choice: tuple) -> Rendered:
-        """Renders a view with path settings, first and refined rays, and tolerance."""
-        settings, first, refined, tolerance = choice
+        """Renders a view with path settings and the numbers of `_ADAPTIVE`."""
+        settings, first, refined, tolerance, background = choice
         begin = time.process_time()
         seen = render_known_camera(
             self.scene,
@@ -192,6 +192,7 @@ class Ours:
             rays_per_pixel=first,
             refined_rays_per_pixel=refined,
             tolerance=tolerance,
+            background_rays_per_pixel=background,
         )
         seconds = time.process_time() - begin
         return Rendered(
@@ -260,12 +261,16 @@ def _truth(cycles: Other, view: View) -> np.ndarray:
 def _ways(folder: Path, others: list[Other]) -> dict[tuple[str, str], Callable]:
     """Returns renderers by name and number of samples: functions of a view and a seed."""
     ours = Ours(folder)
-    uniform = [(TREE, count, None, 0.0) for count in _UNIFORM]
+    uniform = [(TREE, count, None, 0.0, None) for count in _UNIFORM]
     ways: dict[tuple[str, str], Callable] = {}
     for choice in (*uniform, *((TREE, *refined) for refined in _ADAPTIVE), (_FINE, *_ADAPTIVE[-1])):
-        settings, first, refined, _ = choice
+        settings, first, refined, _, background = choice
         name = _REFINED if settings == TREE else f"{_REFINED}, 0.5 %"
-        key = ("tree", str(first)) if refined is None else (name, f"{first} to {refined}")
+        key = (
+            ("tree", str(first))
+            if refined is None
+            else (name, f"{first} to {refined}, {background}")
+        )
         ways[key] = lambda view, _, choice=choice: ours(view, choice)
     for other in others:
         for count in _SAMPLES:

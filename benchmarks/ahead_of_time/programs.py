@@ -12,7 +12,7 @@ from benchmarks.training_setup import usual_samples
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics.light_paths import straight_ends
 from refref_jax.optics.path_settings import capacity_for
-from refref_jax.render import backdrop
+from refref_jax.render import backdrop, images
 from refref_jax.render.model import path_detail
 from refref_jax.sampling.scene_bounds import Domain
 from refref_jax.training import backdrop_equations, loop
@@ -104,7 +104,7 @@ def backdrop_product() -> Program:
 
 
 def _product(levels: backdrop.Pyramid, block: Block) -> backdrop.Pyramid:
-    seen = backdrop_equations._predict(backdrop_equations.mipmap(levels, "unbounded"), block)
+    seen = backdrop_equations._predict(images.mipmap(levels, "unbounded"), block)
     spread = backdrop_equations._transposed(seen, block, resolution=_RESOLUTION)
     return backdrop_equations._mipmap_transposed(spread, "unbounded")
 

@@ -20,6 +20,7 @@ from typing import Any, NoReturn, Self
 
 from absl import app, flags, logging
 
+from experiments.cli import program_cache
 from refref_jax.data import ALLOW_OUTSIDE
 
 INTERRUPTED = 130
@@ -69,6 +70,7 @@ def run(main: Callable[..., None], *, arguments: Sequence[str] = (), again: str 
             threading.Thread(target=_stop_with_input, daemon=True).start()
         logging.set_verbosity(logging.FATAL)  # what Orbax logs as an error it raises, too
         refuse_words(module, words[1:], arguments)
+        program_cache.keep()
         if importlib.util.find_spec("jax_plugins"):  # JAX may run on a GPU
             importlib.import_module("refref_jax.compilation").add_missing_flag()
         try:

@@ -8,7 +8,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Real
 
 from refref_jax.choices import ORIGIN, Position
 from refref_jax.geometry.rays import Rays
@@ -40,10 +40,10 @@ def focal_length(width: int, angle_x: float) -> float:
 def pixel_rays(
     cameras: Cameras,
     camera: Int[np.ndarray, "*shape"],
-    row: Int[np.ndarray, "*shape"],
-    column: Int[np.ndarray, "*shape"],
+    row: Real[np.ndarray, "*shape"],
+    column: Real[np.ndarray, "*shape"],
 ) -> Rays:
-    """Returns the rays through pixel centres, in single precision.
+    """Returns the rays through pixel centres, or places beside them, in single precision.
 
     The radius of a ray is that of a cone with the solid angle of the pixel, scaled so that a disc
     of this radius has the variance of the pixel (mip-NeRF: `2 / sqrt(12)` of its width).
@@ -51,8 +51,8 @@ def pixel_rays(
     Args:
       cameras: the cameras.
       camera: index of the camera of each ray.
-      row: pixel row, 0 at the top.
-      column: pixel column, 0 at the left.
+      row: pixel row, 0 at the top; half a pixel more is its lower edge.
+      column: pixel column, 0 at the left; half a pixel more is its right edge.
     """
     towards, cosine = _unit_directions(cameras, row, column)
     pose = cameras.poses[camera]
@@ -143,6 +143,19 @@ def box_filter(
     return blocks.mean(axis=(1, 3))
 
 
+def lower_median(pixels: Float[np.ndarray, "height width"], side: int) -> Float[np.ndarray, "h w"]:
+    """Returns the median of each pixel's subpixels, the lower of two middle values.
+
+    Args:
+      pixels: image of a supersampled camera.
+      side: subpixels along each edge of a pixel, as in `supersample`.
+    """
+    height, width = pixels.shape
+    blocks = pixels.reshape(height // side, side, width // side, side).swapaxes(1, 2)
+    ordered = np.sort(blocks.reshape(*blocks.shape[:2], side**2), axis=-1)
+    return ordered[..., (side**2 - 1) // 2]
+
+
 def orbit(
     frames: int,
     *,
@@ -216,7 +229,7 @@ def rays_of_views(
 
 
 def planar_directions(
-    cameras: Cameras, row: Int[np.ndarray, "*shape"], column: Int[np.ndarray, "*shape"]
+    cameras: Cameras, row: Real[np.ndarray, "*shape"], column: Real[np.ndarray, "*shape"]
 ) -> Float[np.ndarray, "*shape 3"]:
     """Returns directions to pixel centres in the camera frame, with unit depth."""
     x = (column + 0.5 - 0.5 * cameras.width) / cameras.focal
@@ -225,7 +238,7 @@ def planar_directions(
 
 
 def _unit_directions(
-    cameras: Cameras, row: Int[np.ndarray, "*shape"], column: Int[np.ndarray, "*shape"]
+    cameras: Cameras, row: Real[np.ndarray, "*shape"], column: Real[np.ndarray, "*shape"]
 ) -> tuple[Float[np.ndarray, "*shape 3"], Float[np.ndarray, "*shape"]]:
     """Returns unit directions in the camera frame, and their cosine with the optical axis."""
     planar = planar_directions(cameras, row, column)

@@ -25,9 +25,9 @@ from refref_jax.render.checkpoint_io import load_model as load_model
 from refref_jax.render.images import Rendering as Rendering
 from refref_jax.render.images import render_camera as render_camera
 from refref_jax.render.images import render_image as render_image
-from refref_jax.render.images import render_rays as render_rays
 from refref_jax.render.model import Model as Model
 from refref_jax.render.model import ModelConfig as ModelConfig
 from refref_jax.render.model import Params as Params
 from refref_jax.render.model import init_params as init_params
 from refref_jax.render.pixels import render_ray as render_ray
+from refref_jax.render.pixels import render_rays as render_rays

@@ -51,10 +51,10 @@ _PIXEL_WIDTH = math.sqrt(3.0)
 # XLA unrolls loops over fewer paths, and aborts if a native loop has none left.
 _FEW = 64
 
-# Paths of less throughput have one tap: their detail would not be seen.
-_FAINT = 0.1
+FAINT = 0.1
+"""Throughput below which one tap determines the radiance."""
 
-# A footprint of this width, in cells, covers the surface; near the critical angle it is unbounded.
+# A footprint this wide, in cells, covers the surface; near the critical angle it is unbounded.
 _WIDEST = 1e6
 
 Pyramid = tuple[Float[Array, "6 _ _ channels"], ...]
@@ -116,6 +116,7 @@ def locate(
     resolution: int,
     most_taps: int,
     axes: int = 0,
+    faint: float | Float[Array, ""] = FAINT,
 ) -> Lookups:
     """Returns where light paths end on the surface.
 
@@ -124,8 +125,9 @@ def locate(
       ends: last segments of the paths. Paths without ray differentials have one tap.
       pixels: index of the pixel that each path belongs to.
       resolution: number of cells per side of a face.
-      most_taps: largest number of taps along each axis of a pixel, of paths that are not faint.
+      most_taps: largest number of taps along each axis of a pixel.
       axes: number of axes of the direction that the radiance depends on.
+      faint: throughput below which a path has only one tap.
     """
     faces, places, across = jax.vmap(functools.partial(_place, domain))(
         ends.origins, ends.directions, ends.differentials.points, ends.differentials.directions
@@ -134,7 +136,7 @@ def locate(
     across = jnp.clip(_PIXEL_WIDTH * half * across, -_WIDEST, _WIDEST)
     widths = jnp.sqrt(jnp.sum(jnp.square(across), axis=-1))
     brightest = jnp.max(ends.throughput, axis=-1)
-    most = jnp.where(brightest < _FAINT, 1, most_taps)
+    most = jnp.where(brightest < faint, 1, most_taps)
     coarser = jnp.round(jnp.log2(jnp.maximum(jnp.max(widths, axis=-1) / most, 1.0)))
     levels = jnp.minimum(coarser.astype(jnp.int32), len(sides(resolution)) - 1)
     first, side = jnp.unstack(jnp.asarray(_grids(resolution))[levels], axis=-1)
@@ -349,9 +351,8 @@ def _along(lookups: Lookups, slopes: Float[Array, "*paths 3"]) -> Float[Array, "
 def radiance(mips: Mips, lookups: Lookups) -> Float[Array, "paths 3"]:
     """Returns the linear RGB radiance that each path sees; its throughput does not matter."""
     count = lookups.pixels.shape[0]
-    each = lookups._replace(
-        pixels=jnp.arange(count, dtype=jnp.int32), throughput=jnp.ones_like(lookups.throughput)
-    )
+    numbers = jnp.arange(count, dtype=jnp.int32)
+    each = lookups._replace(pixels=numbers, throughput=jnp.ones_like(lookups.throughput))
     return _colours(count, mips, each)
 
 
@@ -384,10 +385,7 @@ def _colours_forward(
     return _colours(pixels, mips, lookups), (mips, lookups)
 
 
-def _colours_backward(
-    pixels: int, saved: tuple[Mips, Lookups], slopes: Array
-) -> tuple[Mips, Lookups]:
-    del pixels
+def _colours_backward(_: int, saved: tuple[Mips, Lookups], slopes: Array) -> tuple[Mips, Lookups]:
     mips, lookups = saved
     by_throughput = radiance(mips, lookups) * slopes[lookups.pixels]
     # Nothing is the gradient of a constant.

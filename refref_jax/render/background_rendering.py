@@ -28,12 +28,15 @@ from refref_jax.geometry.rays import Rays
 from refref_jax.optics import light_paths, path_tracing
 from refref_jax.optics.light_paths import LightPaths, PathEnds
 from refref_jax.optics.media import Scene
-from refref_jax.optics.path_settings import PathSettings
+from refref_jax.optics.path_settings import STRAIGHT, PathSettings
 from refref_jax.render import images, pixels
 from refref_jax.render.backgrounds import Radiance
 
 TILE = 65536
-"""Number of rays traced at once."""
+"""Largest number of rays traced at once."""
+
+# Number of tiles of an image whose rays all meet an object, if they are small enough.
+_TILES = 4
 
 _INSTEAD = (
     "Call it outside, or use trace or follow_main_branches and shade, which are pure functions."
@@ -55,7 +58,7 @@ class KnownRendering(NamedTuple):
       paths: number of light paths of each ray.
       dropped: dropped throughput of each ray, because a path buffer was full or truncated paths are
         black.
-      casts: total number of closest-hit queries.
+      casts: total number of closest-hit queries; what tells which rays to trace is not counted.
     """
 
     rgb: Float[np.ndarray, "*rays 3"]
@@ -90,7 +93,6 @@ class _Tile(NamedTuple):
     linear: Float[Array, "rays 3"]
     paths: Int[Array, " rays"]
     dropped: Float[Array, "rays 3"]
-    casts: Int[Array, ""]
 
 
 def render_known(
@@ -104,6 +106,8 @@ def render_known(
 ) -> KnownRendering:
     """Renders any number of rays in front of a known background; 0 rays give an empty rendering.
 
+    Rays that meet no object are straight, and are not traced, unless `interior_list` is given.
+
     Args:
       scene: the scene.
       radiance: function of origin and direction that returns the background's linear RGB.
@@ -111,8 +115,8 @@ def render_known(
       settings: path settings.
       interior_list: interior list of each ray's origin, where rays carry one (see
         `media.interior_length` and `data.mesh_queries.parts_around`); none by default.
-      tile: number of rays traced at once. Lower it if memory runs out. The rays of a tile share the
-        path buffers, so with few rays, throughput is dropped sooner.
+      tile: largest number of rays traced at once. Lower it if memory runs out. The rays of a tile
+        share the path buffers: a tile that drops light is rendered again in halves.
 
     Raises:
       ValueError: if `tile` is less than 1, the radiance function does not return three numbers, or
@@ -133,26 +137,51 @@ def render_known(
     """
     if tile < 1:
         raise ValueError(f"tile is {tile}, but a tile needs rays. Give 1 or more.")
-    count = rays.radii.size
-    tile = images.size_for(count, most=tile)
+    # Of all rays of an image, a part meets glass; this size is the same for all images of a size.
+    tile = images.size_for(-(-rays.radii.size // _TILES), most=tile)
     # Transferred to the device once, not once per tile.
     scene, radiance = jax.device_put((scene, _as_argument(radiance)))
+    render = functools.partial(_in_tiles, scene, radiance, tile=tile)
+    if interior_list is not None or settings.max_bends == 0:
+        return render(rays, interior_list, settings=settings)
+    rays = images.fetch(rays, instead=_INSTEAD)
+    met, hits, misses = images.split_by_hit(scene.surfaces, rays, tile=tile)
+    bent, straight = render(hits, None, settings=settings), render(misses, None, settings=STRAIGHT)
+    pairs = zip(bent[:-1], straight[:-1], strict=True)
+    rgb, linear, paths, dropped = (images.merged(met, *each) for each in pairs)
+    return KnownRendering(rgb, linear, paths, dropped, bent.casts + misses.radii.size)
+
+
+def _in_tiles(
+    scene: Scene,
+    radiance: Radiance,
+    rays: Rays,
+    interior_list: Int[np.ndarray, "*rays slots"] | None,
+    *,
+    settings: PathSettings,
+    tile: int,
+) -> KnownRendering:
+    """Renders rays tile by tile; arguments as in `render_known`."""
     casts = []
 
-    def see(
-        rays: Rays, interior_list: Int[np.ndarray, "rays slots"] | None, real: int
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def see(rays: Rays, interior_list: Int[np.ndarray, "rays slots"] | None, real: int) -> _Tile:
+        seen, count = _render_tile(scene, radiance, rays, interior_list, settings=settings)
         # Each padding ray misses, which counts as one cast if rays are cast at all.
-        seen: Any = images.fetch(
-            _render_tile(scene, radiance, rays, interior_list, settings=settings), instead=_INSTEAD
-        )
-        casts.append(int(seen.casts) - (tile - real) * (settings.max_bends > 0))
-        return seen[:-1]
+        casts.append(int(images.fetch(count, instead=_INSTEAD)))
+        casts.append((real - tile) * (settings.max_bends > 0))
+        return seen
 
-    fields = images.in_tiles(
-        see, rays, tile=tile, nothing=_blank()[:-1], instead=_INSTEAD, interior_list=interior_list
+    black = np.zeros((0, 3), np.float32)
+    nothing: Any = (black, black, np.zeros(0, np.int32), black)
+    seen: Any = images.in_tiles(
+        see,
+        rays,
+        tile=tile,
+        nothing=_Tile(*nothing),
+        instead=_INSTEAD,
+        interior_list=interior_list,
     )
-    return KnownRendering(*fields, sum(casts))
+    return KnownRendering(seen.rgb, seen.linear, seen.paths, seen.dropped, sum(casts))
 
 
 def render_known_camera(
@@ -165,6 +194,7 @@ def render_known_camera(
     rays_per_pixel: int = 4,
     refined_rays_per_pixel: int | None = None,
     tolerance: float = 0.1,
+    background_rays_per_pixel: int | None = None,
     interior_list: Int[np.ndarray, " slots"] | None = None,
     tile: int = TILE,
 ) -> KnownImage:
@@ -186,12 +216,16 @@ def render_known_camera(
         every pixel has `rays_per_pixel` by default.
       tolerance: difference between the largest and the smallest sRGB value in `[0, 1]` of
         neighbouring rays, in the worst channel, up to which a pixel is not refined.
+      background_rays_per_pixel: number of rays in pixels that show nothing but the background, a
+        larger square; these rays are straight and cost little. None of their first rays, nor of the
+        next pixels', meets an object, and `interior_list` must not be given.
       interior_list: interior list of the camera's position, see `render_known`.
       tile: number of rays traced at once, see `render_known`.
 
     Raises:
-      ValueError: if a number of rays is not a square, the refined number is not larger, the
-        tolerance is negative, or `render_known` rejects its arguments.
+      ValueError: if a number of rays is not a square, those of some pixels are not more than those
+        of all, the tolerance is negative, an interior list is given with rays of the background, or
+        `render_known` rejects its arguments.
       TypeError: if it is called in a function that JAX transforms.
 
     Example:
@@ -208,11 +242,14 @@ def render_known_camera(
       >>> image.rgb.shape, sorted(set(image.rays.ravel().tolist()))
       ((8, 8, 3), [4, 16])
     """
-    _check_refinement(rays_per_pixel, refined_rays_per_pixel, tolerance)
+    _check_numbers(rays_per_pixel, refined_rays_per_pixel, background_rays_per_pixel, tolerance)
+    if background_rays_per_pixel is not None and interior_list is not None:
+        raise ValueError("Rays from inside an object bend. Leave out background_rays_per_pixel.")
     scene, radiance = jax.device_put((scene, _as_argument(radiance)))
+    row, column = np.indices((cameras.height, cameras.width))
 
-    def see(row: np.ndarray, column: np.ndarray, count: int) -> KnownRendering:
-        rays = _rays_of_pixels(cameras, view, row, column, side_of(count))
+    def see(where: np.ndarray, count: int, settings: PathSettings) -> KnownRendering:
+        rays = _rays_of_pixels(cameras, view, row[where], column[where], side_of(count))
         listed = interior_list
         if listed is not None:
             listed = np.broadcast_to(listed, (*rays.radii.shape, *listed.shape))
@@ -220,15 +257,23 @@ def render_known_camera(
             scene, radiance, rays, settings=settings, interior_list=listed, tile=tile
         )
 
-    row, column = np.indices((cameras.height, cameras.width))
-    seen = see(row, column, rays_per_pixel)
+    seen = see(np.full(row.shape, True), rays_per_pixel, settings)
     casts, rays = seen.casts, np.full(row.shape, rays_per_pixel, np.int32)
-    linear, dropped = seen.linear.mean(axis=2), seen.dropped.mean(axis=2)
+    linear, dropped = seen.linear.mean(axis=1), seen.dropped.mean(axis=1)
+    linear, dropped = linear.reshape(*row.shape, 3), dropped.reshape(*row.shape, 3)
+    clear, again = np.full((2, *row.shape), False)
+    if background_rays_per_pixel is not None:
+        clear = _shows_background(scene, cameras, view, rays_per_pixel)
     if refined_rays_per_pixel is not None:
-        again = _contrast(seen.rgb) > tolerance
-        finer = see(row[again], column[again], refined_rays_per_pixel)
-        casts, rays[again] = casts + finer.casts, refined_rays_per_pixel
-        linear[again], dropped[again] = finer.linear.mean(axis=1), finer.dropped.mean(axis=1)
+        again = ~clear & (_contrast(seen.rgb.reshape(*row.shape, -1, 3)) > tolerance)
+    for where, count, bends in (
+        (clear, background_rays_per_pixel, STRAIGHT),
+        (again, refined_rays_per_pixel, settings),
+    ):
+        if count is not None:
+            finer = see(where, count, bends)
+            casts, rays[where] = casts + finer.casts, count
+            linear[where], dropped[where] = finer.linear.mean(axis=1), finer.dropped.mean(axis=1)
     rgb = np.clip(np.asarray(pixels.linear_to_srgb(jax.device_put(linear))), 0.0, 1.0)
     return KnownImage(rgb, linear, rays, dropped, casts)
 
@@ -282,17 +327,31 @@ def _as_argument(radiance: Radiance) -> Radiance:
     return jax.tree_util.Partial(radiance) if plain else radiance
 
 
-def _check_refinement(count: int, refined: int | None, tolerance: float) -> None:
-    for number in (count, refined):
+def _check_numbers(
+    count: int, refined: int | None, background: int | None, tolerance: float
+) -> None:
+    for number in (count, refined, background):
         if number is not None:
             side_of(number)
     if not tolerance >= 0.0:
         raise ValueError(f"tolerance is {tolerance}. Give 0 or more.")
-    if refined is not None and not count < refined:
-        raise ValueError(
-            f"refined_rays_per_pixel is {refined}, not more than rays_per_pixel, {count}. Give a "
-            "larger square, or None."
-        )
+    for name, number in (("refined", refined), ("background", background)):
+        if number is not None and not count < number:
+            raise ValueError(
+                f"{name}_rays_per_pixel is {number}, not more than rays_per_pixel, {count}. Give a "
+                "larger square, or None."
+            )
+
+
+def _shows_background(
+    scene: Scene, cameras: Cameras, view: int, rays_per_pixel: int
+) -> Bool[np.ndarray, "h w"]:
+    """Returns which pixels have no ray that meets an object, and no neighbour that has one."""
+    row, column = np.indices((cameras.height, cameras.width))
+    rays = _rays_of_pixels(cameras, view, row, column, side_of(rays_per_pixel))
+    met = np.isfinite(images.find_first_surface(scene.surfaces, rays).distances).any(axis=2)
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(met, 1), (3, 3))
+    return np.logical_not(around.any(axis=(2, 3)))
 
 
 def _rays_of_pixels(
@@ -302,9 +361,17 @@ def _rays_of_pixels(
     column: Int[np.ndarray, "*pixels"],
     side: int,
 ) -> Rays:
-    """Returns the `side * side` rays of some pixels, as `[*pixels, rays]`, row by row."""
+    """Returns the `side * side` rays of some pixels, as `[*pixels, rays]`, row by row.
+
+    Every square of a pixel has one ray, and so have all `side * side` rows and columns of the
+    pixel: an edge along them is resolved by as many steps as there are rays.
+
+    Source: Kensler, Correlated Multi-Jittered Sampling (2013), the canonical arrangement.
+    """
     down, along = (x.ravel() for x in np.indices((side, side)))
-    fine_row, fine_column = side * row[..., None] + down, side * column[..., None] + along
+    lower, further = 0.5 - (along + 0.5) / side, (down + 0.5) / side - 0.5
+    fine_row = side * row[..., None] + down + lower
+    fine_column = side * column[..., None] + along + further
     fine = pinholes.supersample(cameras, side)
     rays = pinholes.pixel_rays(fine, np.full(fine_row.shape, view), fine_row, fine_column)
     pixel = np.broadcast_to((row * cameras.width + column)[..., None], fine_row.shape)
@@ -329,11 +396,6 @@ def _contrast(rgb: Float[np.ndarray, "h w rays 3"]) -> Float[np.ndarray, "h w"]:
     return spread.reshape(height, side, width, side).max(axis=(1, 3))
 
 
-def _blank() -> KnownRendering:
-    nothing = np.zeros((0, 3), np.float32)
-    return KnownRendering(nothing, nothing, np.zeros(0, np.int32), nothing, casts=0)
-
-
 @functools.partial(jax.jit, static_argnames="settings")
 def _render_tile(
     scene: Scene,
@@ -342,7 +404,8 @@ def _render_tile(
     interior_list: Int[Array, "rays slots"] | None,
     *,
     settings: PathSettings,
-) -> _Tile:
+) -> tuple[_Tile, Int[Array, ""]]:
+    """Returns rendered rays, and the number of casts."""
     count = rays.radii.shape[0]
     # Behind a rough surface, a ray stands for the facets between it and the pixel's other rays.
     rough = rays.strata is not None and scene.interfaces.alpha.shape[0] > 0
@@ -356,13 +419,13 @@ def _render_tile(
     ends = traced.ends
     linear = _sum_light(radiance, ends, count)
     exists = light_paths.exists(ends).astype(jnp.int32)
-    return _Tile(
+    seen = _Tile(
         rgb=jnp.clip(pixels.linear_to_srgb(linear), 0.0, 1.0),
         linear=linear,
         paths=jax.ops.segment_sum(exists, ends.rays, num_segments=count),
         dropped=traced.dropped,
-        casts=traced.casts,
     )
+    return seen, traced.casts
 
 
 def _sum_light(radiance: Radiance, ends: PathEnds, rays: int) -> Float[Array, "rays 3"]:

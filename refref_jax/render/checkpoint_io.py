@@ -138,10 +138,10 @@ def open_checkpoints(run: Path, *, keep: int | None = None) -> ocp.CheckpointMan
     # Orbax warns about its option `read_only` each time; a manager that only restores does not
     # write either.
     chosen = {"create": False} if keep is None else {"max_to_keep": keep}
+    # Every save is waited for. In the background Orbax gives up by the time of day, which may jump.
+    options = ocp.CheckpointManagerOptions(enable_async_checkpointing=False, **chosen)
     return ocp.CheckpointManager(
-        (run / CHECKPOINTS).absolute(),
-        item_names=(PARAMS_ITEM, TRAINING_ITEM),
-        options=ocp.CheckpointManagerOptions(**chosen),
+        (run / CHECKPOINTS).absolute(), item_names=(PARAMS_ITEM, TRAINING_ITEM), options=options
     )
 
 

@@ -14,7 +14,7 @@ Colours are averaged as linear light and encoded afterwards, as a camera does.
 
 import functools
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple, TypeVar, get_args
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -25,18 +25,20 @@ from refref_jax import numerics
 from refref_jax.choices import side_of
 from refref_jax.compilation import runs_on_cpu
 from refref_jax.geometry import bvh
+from refref_jax.geometry import cameras as pinholes
 from refref_jax.geometry.cameras import Cameras, box_filter, pixel_rays, supersample
 from refref_jax.geometry.rays import Rays
 from refref_jax.geometry.surfaces import LevelSet, Surfaces, closest, meet, surface_point
 from refref_jax.numerics import host_array
-from refref_jax.optics import light_paths, path_tracing
-from refref_jax.optics.light_paths import Branch, LightPaths, reflected_first
+from refref_jax.optics import path_tracing
+from refref_jax.optics.light_paths import Branch
 from refref_jax.optics.media import EMPTY_SLOT, Scene
-from refref_jax.optics.path_settings import Detail, PathSettings
-from refref_jax.optics.path_tracing import Traced
-from refref_jax.render import learned_media, pixels
-from refref_jax.render.model import Model, ModelConfig, Params, path_detail
+from refref_jax.optics.path_settings import STRAIGHT, Detail, PathSettings
+from refref_jax.render import backdrop, learned_media, pixels
+from refref_jax.render.backdrop import Mips
+from refref_jax.render.model import Model, ModelConfig, Params, is_backdrop, path_detail, surface_of
 from refref_jax.render.model import Rendering as Rendering
+from refref_jax.render.pixels import ALL, BRANCHES, BackdropEnds, TilePaths
 
 # Padding rays of a tile start at this distance and point away from the scene: they hit nothing and
 # leave the capacity of the path buffers to the other rays.
@@ -53,18 +55,22 @@ TILE = 16384
 CHUNK = 4096
 """Number of paths rendered at once on a CPU; see `on_this_device`."""
 
+_FEWEST = 16  # parts of a tile below which it is not halved again
+
 # An accelerator takes as many times the rays and paths, since the host waits for each tile.
 _TIMES = 16
-
-CAST_TILE = 65536
-"""Number of rays cast at once."""
 
 NO_PART = -1
 
 _CAST_INSTEAD = "Call it outside, or cast single rays with bvh.closest_hits."
 _INSTEAD = "Call it outside, or use render_rays, which is a pure function."
-_BRANCHES: tuple[Branch, ...] = get_args(Branch)
-_ALL, _TRANSMITTED, _REFLECTED = range(len(_BRANCHES))
+
+backdrop_ends = jax.jit(
+    pixels.backdrop_ends,
+    static_argnames=("settings", "domain", "resolution", "most_taps", "axes", "tally", "fields"),
+)
+mipmap = jax.jit(backdrop.mipmap, static_argnames="space")
+_finish = jax.jit(pixels.finish)
 
 RAYS_OF_A_BAND = 1 << 18
 """Maximum number of rays held at once, unless one row of pixels has more."""
@@ -95,15 +101,36 @@ def in_tiles(
     """
     rays, interior_list = fetch((rays, interior_list), instead=instead)
     shape, count = rays.radii.shape, rays.radii.size
-    flat, listed = jax.tree.map(
-        lambda x: x.reshape(-1, *x.shape[len(shape) :]), (rays, interior_list)
-    )
-    parts = []
-    for start in range(0, count, tile):
-        seen = see(*crop(flat, listed, start, tile), min(tile, count - start))
-        parts.append(fetch(seen, instead=instead))
+    ends = len(shape)
+    flat, listed = jax.tree.map(lambda x: x.reshape(-1, *x.shape[ends:]), (rays, interior_list))
+    parts = [
+        _see_tile(see, *crop(flat, listed, start, tile), min(tile, count - start), instead)
+        for start in range(0, count, tile)
+    ]
     joined = join(parts or [nothing])
     return jax.tree.map(lambda x: x[:count].reshape((*shape, *x.shape[1:])), joined)
+
+
+def _see_tile(
+    see: Callable[..., Any], rays: Rays, listed: np.ndarray | None, real: int, instead: str
+) -> Any:
+    """Renders a tile; in halves, if light was dropped because its paths did not fit the buffers."""
+    seen = fetch(see(rays, listed, real), instead=instead)
+    lost, tile, half = np.sum(getattr(seen, "dropped", 0.0)), rays.radii.size, -(-real // 2)
+    if not lost or real <= tile // _FEWEST:
+        return seen
+    first, second = (
+        _see_tile(see, *crop(*_of((rays, listed), part), 0, tile), count, instead)
+        for part, count in ((slice(half), half), (slice(half, real), real - half))
+    )
+    whole = join([_of(first, slice(half)), _of(second, slice(tile - half))])
+    # Truncated paths that are black are dropped, too: fewer rays at once do not help.
+    return whole if np.sum(whole.dropped) < lost else seen
+
+
+def _of(tree: _Tree, which: Any) -> _Tree:
+    """Returns some of the values of all arrays of a pytree."""
+    return jax.tree.map(lambda x: host_array(x[which]), tree)
 
 
 def on_this_device(size: int) -> int:
@@ -168,40 +195,6 @@ def crop(
     return jax.tree.map(lambda a, b: np.concatenate([a, b]), (part, within), (filling, nowhere))
 
 
-class _Tile(NamedTuple):
-    """The paths of a tile, with the selected paths first.
-
-    Attributes:
-      paths: light paths.
-      heaviest: whether a path is the heaviest of its ray.
-      count: number of selected paths.
-      dropped: dropped throughput of each ray.
-    """
-
-    paths: LightPaths
-    heaviest: Bool[Array, " paths"]
-    count: Int[Array, ""]  # type: ignore[assignment]  # hides tuple.count
-    dropped: Float[Array, "rays 3"]
-
-
-def render_rays(model: Model, rays: Rays) -> Rendering:
-    """Renders rays in one piece: a pure function, to be jitted or differentiated by the caller.
-
-    A trained model is in single precision, and so are its renderings.
-
-    Args:
-      model: trained model.
-      rays: camera rays `[n]`. They share the path buffers, so with few rays, throughput is dropped
-        sooner.
-    """
-    rays = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), rays)
-    detail = path_detail(model.config, model.settings)
-    traced = path_tracing.trace(model.scene, rays, settings=model.settings, detail=detail)
-    tile = _sort(traced, traced.dropped.shape[0])
-    sums = _blank(tile.dropped)
-    return _finish(_add(model.params, tile.paths, tile.heaviest, sums, config=model.config))
-
-
 def render_image(
     model: Model, rays: Rays, *, chunk: int | None = None, branch: Branch = "both"
 ) -> Rendering:
@@ -222,13 +215,15 @@ def render_image(
       ValueError: if `chunk` is less than 1, or `branch` is unknown.
       TypeError: if it is called in a function that JAX transforms.
     """
-    if branch not in _BRANCHES:
-        raise ValueError(f"branch is {branch!r}, unknown. Use one of {', '.join(_BRANCHES)}.")
+    if branch not in BRANCHES:
+        raise ValueError(f"branch is {branch!r}, unknown. Use one of {', '.join(BRANCHES)}.")
     chunk = on_this_device(CHUNK) if chunk is None else chunk
     if chunk < 1:
         raise ValueError(f"chunk is {chunk}, but a chunk needs paths. Give 1 or more.")
     rays = jax.tree.map(np.float32, fetch(rays, instead=_INSTEAD))
-    nothing = jax.device_get(_blank(jax.device_put(np.zeros((0, 3), np.float32))))
+    nothing = jax.device_get(pixels.blank(jax.device_put(np.zeros((0, 3), np.float32))))
+    if is_backdrop(model.config) and branch == "both":
+        return _render_backdrop(model, rays, nothing)
     return in_tiles(
         lambda tile, _, real: _render_tile(model, tile, real, chunk, branch),
         rays,
@@ -238,24 +233,90 @@ def render_image(
     )
 
 
+def _render_backdrop(model: Model, rays: Rays, nothing: Rendering) -> Rendering:
+    """Renders rays in front of a backdrop; those that meet no object are straight."""
+    shape, config = model.config.backdrop, model.config
+    assert shape is not None
+    params, scene = jax.device_put((model.params, model.scene))
+    mips = mipmap(surface_of(params), config.space)
+    look = functools.partial(
+        backdrop_ends,
+        scene,
+        domain=config.domain,
+        resolution=shape.resolution,
+        most_taps=shape.most_taps,
+        axes=shape.axes,
+        tally=path_detail(config, model.settings).tally,
+        fields=(),
+        faint=0.0,
+    )
+
+    def render(some: Rays, settings: PathSettings) -> Rendering:
+        return in_tiles(
+            lambda tile, *_: _of_backdrop(params, mips, *look(tile, settings=settings)),
+            some,
+            tile=tile_for(max(rays.radii.size, TILE)),
+            nothing=nothing,
+            instead=_INSTEAD,
+        )
+
+    met, hits, misses = split_by_hit(scene.surfaces, rays)
+    seen = render(hits, model.settings), render(misses, STRAIGHT)
+    return jax.tree.map(functools.partial(merged, met), *seen)
+
+
+def split_by_hit(
+    surfaces: Surfaces | LevelSet, rays: Rays, *, tile: int | None = None
+) -> tuple[Bool[np.ndarray, "*rays"], Rays, Rays]:
+    """Returns which rays meet an object, these rays and the others; `merged` joins their values."""
+    met = np.isfinite(find_first_surface(surfaces, rays, tile=tile).distances)
+    return met, _of(rays, met), _of(rays, ~met)
+
+
+def merged(met: np.ndarray, some: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Returns values of all rays from those of the rays that meet an object, and of the others."""
+    whole = np.empty((*met.shape, *some.shape[1:]), some.dtype)
+    whole[met], whole[~met] = some, others
+    return whole
+
+
+@jax.jit
+def _of_backdrop(
+    params: Params, mips: Mips, ends: BackdropEnds, dropped: Float[Array, "rays 3"]
+) -> Rendering:
+    """Renders rays in front of a backdrop, given its mipmap and the ends of their paths."""
+    lookups, count = ends.lookups, dropped.shape[0]
+    share = jnp.mean(lookups.throughput, axis=-1)
+    most = jax.ops.segment_max(share, lookups.pixels, num_segments=count)
+    heaviest = (ends.distances > 0.0) & (share >= most[lookups.pixels])
+    if params.tints is not None:
+        left = learned_media.transmittance(params.tints, ends.crossings)
+        lookups = lookups._replace(throughput=lookups.throughput * left)
+    sums = pixels.blank(dropped)
+    target = jnp.where(heaviest, lookups.pixels, count)
+    distance = sums.distance.at[target].set(ends.distances, mode="drop")
+    share = jnp.mean(lookups.throughput, axis=-1)
+    return pixels.finish(
+        sums._replace(
+            distance=distance,
+            mean_distance=distance,
+            accumulation=sums.accumulation.at[lookups.pixels].add(share),
+            linear=backdrop.colours(mips, lookups, pixels=count),
+        )
+    )
+
+
 def _render_tile(model: Model, rays: Rays, real: int, chunk: int, branch: Branch) -> Rendering:
     detail = path_detail(model.config, model.settings)
-    which = _BRANCHES.index(branch)
+    which = BRANCHES.index(branch)
     tile = _trace_tile(model.scene, rays, real, which, settings=model.settings, detail=detail)
-    sums = _blank(tile.dropped)
+    sums = pixels.blank(tile.dropped)
     count = int(fetch(tile.count, instead=_INSTEAD))
     if model.config.backdrop is not None:  # every chunk builds its mipmap
         chunk = tile.paths.radii.size
     for start in range(0, count, chunk):
         sums = _render_chunk(model.params, tile, sums, start, config=model.config, chunk=chunk)
-    return _finish_tile(sums)
-
-
-def _blank(dropped: Float[Array, "rays 3"]) -> Rendering:
-    """Returns the initial rendering, before any path is added."""
-    black = jnp.zeros_like(dropped)
-    zeros = black[:, 0]
-    return Rendering(black, zeros, zeros, zeros, linear=black, dropped=dropped)
+    return _finish(sums)
 
 
 @functools.partial(jax.jit, static_argnames=("settings", "detail"))
@@ -263,19 +324,19 @@ def _trace_tile(
     scene: Scene,
     rays: Rays,
     real: Int[Array, ""],
-    which: int | Int[Array, ""] = _ALL,
+    which: int | Int[Array, ""] = ALL,
     *,
     settings: PathSettings,
     detail: Detail,
-) -> _Tile:
+) -> TilePaths:
     traced = path_tracing.trace(scene, rays, settings=settings, detail=detail)
-    return _sort(traced, real, which)
+    return pixels.sort_paths(traced, real, which=which)
 
 
 @functools.partial(jax.jit, static_argnames=("config", "chunk"))
 def _render_chunk(
     params: Params,
-    tile: _Tile,
+    tile: TilePaths,
     sums: Rendering,
     start: Int[Array, ""],
     *,
@@ -288,61 +349,7 @@ def _render_chunk(
     paths = jax.tree.map(lambda x: x[held], tile.paths)
     real = index < tile.count
     paths = paths._replace(throughput=jnp.where(real[:, None], paths.throughput, 0.0))
-    return _add(params, paths, tile.heaviest[held] & real, sums, config=config)
-
-
-@jax.jit
-def _finish_tile(sums: Rendering) -> Rendering:
-    return _finish(sums)
-
-
-def _sort(traced: Traced, real: int | Int[Array, ""], which: int | Int[Array, ""] = _ALL) -> _Tile:
-    """Moves the selected paths to the front and marks the heaviest path of each ray.
-
-    Args:
-      traced: traced paths of a tile.
-      real: number of rays in the tile that are not padding.
-      which: index of the selected branch in `_BRANCHES`.
-    """
-    paths, rays = traced.paths, traced.dropped.shape[0]
-    branch = jnp.where(reflected_first(paths), _REFLECTED, _TRANSMITTED)
-    exists = light_paths.exists(paths) & (paths.rays < real)
-    exists &= (which == _ALL) | (which == branch)
-    order = jnp.argsort(~exists, stable=True)
-    throughput = jnp.mean(paths.throughput, axis=-1)
-    most = jax.ops.segment_max(throughput, paths.rays, num_segments=rays)
-    heaviest = exists & (throughput >= most[paths.rays])
-    sorted_paths = jax.tree.map(lambda x: x[order], paths)
-    return _Tile(sorted_paths, heaviest[order], jnp.sum(exists), traced.dropped)
-
-
-def _add(
-    params: Params,
-    paths: LightPaths,
-    heaviest: Bool[Array, " paths"],
-    sums: Rendering,
-    *,
-    config: ModelConfig,
-) -> Rendering:
-    """Adds some paths to the linear colours and distances of their rays."""
-    jitter = pixels.no_jitter(config, paths.radii.shape[0])
-    one = jnp.ones((), paths.radii.dtype)
-    seen = pixels.render_paths(params, config, paths, jitter, anneal=one).composite
-    paths = learned_media.attenuate(params.tints, paths, radius=config.radius)
-    share = jnp.mean(paths.throughput, axis=-1)
-    rays = sums.distance.shape[0]
-    # Writes to an index past the end are dropped.
-    target = jnp.where(heaviest, paths.rays, rays)
-    return sums._replace(
-        linear=sums.linear.at[paths.rays].add(paths.throughput * seen.rgb),
-        distance=sums.distance.at[target].set(seen.median, mode="drop"),
-        mean_distance=sums.mean_distance.at[target].set(seen.mean, mode="drop"),
-        accumulation=sums.accumulation.at[paths.rays].add(share * seen.accumulation),
-    )
-
-
-def _finish(sums: Rendering) -> Rendering:
-    return sums._replace(rgb=jnp.clip(pixels.linear_to_srgb(sums.linear), 0.0, 1.0))
+    return pixels.add_paths(params, paths, tile.heaviest[held] & real, sums, config=config)
 
 
 def render_camera(
@@ -388,7 +395,8 @@ def render_camera(
 
 def warm_up(model: Model, cameras: Cameras, *, rays_per_pixel: int, chunk: int | None) -> None:
     """Compiles all programs of `render_camera`, so that later timings are of rendering alone."""
-    if runs_on_cpu() and model.config.splats is None:  # one tile size serves all images
+    on_cpu = runs_on_cpu() and model.config.splats is None
+    if on_cpu and not is_backdrop(model.config):  # one tile size serves all images
         render_image(model, pixel_rays(cameras, *np.zeros((3, 1), np.int64)), chunk=chunk)
     else:
         render_camera(model, cameras, 0, rays_per_pixel=rays_per_pixel, chunk=chunk)
@@ -397,10 +405,8 @@ def warm_up(model: Model, cameras: Cameras, *, rays_per_pixel: int, chunk: int |
 def average(fine: Rendering, side: int) -> Rendering:
     """Averages the small pixels of a supersampled camera.
 
-    Colours are averaged as linear light, without clipping, and then encoded and clipped; mean
-    distances and accumulations are averaged as they are. The distance is the median over the small
-    pixels, or the lower of the two middle values if their number is even. At an edge it is thus the
-    distance of one of the two surfaces, never one between them.
+    Colours are averaged as linear light, and then encoded and clipped. The distance is the lower
+    median: at an edge it is that of one of the two surfaces, never one between them.
     """
 
     def filtered(values: Array | np.ndarray) -> Any:
@@ -409,19 +415,12 @@ def average(fine: Rendering, side: int) -> Rendering:
     linear = filtered(fine.linear)
     return Rendering(
         rgb=np.clip(jax.device_get(pixels.linear_to_srgb(jax.device_put(linear))), 0.0, 1.0),
-        distance=host_array(_lower_median(np.asarray(fine.distance), side)),
+        distance=host_array(pinholes.lower_median(np.asarray(fine.distance), side)),
         mean_distance=filtered(fine.mean_distance),
         accumulation=filtered(fine.accumulation),
         linear=linear,
         dropped=filtered(fine.dropped),
     )
-
-
-def _lower_median(fine: Float[np.ndarray, "height width"], side: int) -> Float[np.ndarray, "h w"]:
-    height, width = fine.shape
-    blocks = fine.reshape(height // side, side, width // side, side).swapaxes(1, 2)
-    ordered = np.sort(blocks.reshape(*blocks.shape[:2], side**2), axis=-1)
-    return ordered[..., (side**2 - 1) // 2]
 
 
 def _bands(cameras: Cameras, view: int, *, rows: int) -> Iterator[Rays]:
@@ -446,18 +445,19 @@ class FirstSurface(NamedTuple):
 
 
 def find_first_surface(
-    surfaces: Surfaces | LevelSet, rays: Rays, *, tile: int = CAST_TILE
+    surfaces: Surfaces | LevelSet, rays: Rays, *, tile: int | None = None
 ) -> FirstSurface:
     """Casts rays and returns the first surface of each.
 
     Args:
       surfaces: surfaces of the scene.
       rays: rays with any leading axes, usually `[height, width]`, and unit directions.
-      tile: number of rays cast at once.
+      tile: number of rays cast at once, by default 16,384, and 262,144 off CPUs.
 
     Raises:
       ValueError: if `tile` is less than 1.
     """
+    tile = on_this_device(TILE) if tile is None else tile
     if tile < 1:
         raise ValueError(f"tile is {tile}, but a tile needs rays. Give 1 or more.")
     surfaces = jax.device_put(surfaces)

@@ -90,8 +90,15 @@ def attenuate(learned: LearnedTints | None, paths: LightPaths, *, radius: float)
     """
     if learned is None:
         return paths
-    dimmed = jnp.exp(numerics.product(-crossings(paths, radius=radius), densities(learned)))
+    dimmed = transmittance(learned, crossings(paths, radius=radius))
     return paths._replace(throughput=paths.throughput * dimmed)
+
+
+def transmittance(
+    learned: LearnedTints, crossed: Float[Array, "paths unknowns"]
+) -> Float[Array, "paths 3"]:
+    """Returns what tints and absorption leave of paths, given their `crossings`; linear RGB."""
+    return jnp.exp(numerics.product(-crossed, densities(learned)))
 
 
 def crossings(paths: LightPaths, *, radius: float) -> Float[Array, "paths unknowns"]:

@@ -292,7 +292,8 @@ def init_params(key: Array, config: ModelConfig) -> Params:
 
         return Params((), gaussians.blank(config.splats.gaussians), None)
     colours = learned_media.init(config.learned_tints) if config.learned_tints else None
-    if config.backdrop is not None and not has_foreground(config):
+    if is_backdrop(config):
+        assert config.backdrop is not None
         surface = backdrop.init(config.backdrop.resolution, axes=config.backdrop.axes)
         return Params((), surface, colours)
     field_key, *keys = jax.random.split(key, 1 + len(config.proposals))
@@ -311,6 +312,11 @@ def init_params(key: Array, config: ModelConfig) -> Params:
 def has_foreground(config: ModelConfig) -> bool:
     """Returns whether a field is in front of a backdrop."""
     return config.backdrop is not None and config.backdrop.in_front == "field"
+
+
+def is_backdrop(config: ModelConfig) -> bool:
+    """Returns whether a model is a backdrop and nothing in front of it."""
+    return config.backdrop is not None and not has_foreground(config)
 
 
 def surface_of(params: Params) -> Pyramid:

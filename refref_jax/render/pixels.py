@@ -15,11 +15,11 @@ multisamples of intervals.
 
 import functools
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax.fields import registry
 from refref_jax.fields.base import Radiance
@@ -27,8 +27,12 @@ from refref_jax.geometry.cameras import Cameras, image_rays
 from refref_jax.geometry.rays import Rays
 from refref_jax.numerics import host_array
 from refref_jax.optics import light_paths, path_tracing
-from refref_jax.optics.light_paths import LightPaths, PathStatus
+from refref_jax.optics.light_paths import Branch, LightPaths, PathStatus, reflected_first
+from refref_jax.optics.media import Scene
+from refref_jax.optics.path_settings import Detail, PathSettings, Tally
+from refref_jax.optics.path_tracing import Traced
 from refref_jax.render import backdrop, learned_media, volume_rendering
+from refref_jax.render.backdrop import Lookups
 from refref_jax.render.model import (
     Model,
     ModelConfig,
@@ -40,10 +44,15 @@ from refref_jax.render.model import (
 )
 from refref_jax.render.volume_rendering import Composite, Histogram, Jitter, PathRadiance
 from refref_jax.sampling import scene_bounds
+from refref_jax.sampling.scene_bounds import Domain
 
 # Thresholds between the linear and the power segment of the transfer function.
 _LINEAR_KNEE = 0.0031308
 _SRGB_KNEE = 0.04045
+
+BRANCHES: tuple[Branch, ...] = get_args(Branch)
+"""Selections of paths by their branch at the first surface; `ALL` is the index of the first."""
+ALL, _TRANSMITTED, _REFLECTED = range(len(BRANCHES))
 
 
 class Light(NamedTuple):
@@ -163,6 +172,173 @@ def _see_backdrop(params: Params, config: ModelConfig, paths: LightPaths) -> Com
         median=distance,
         mean=distance,
     )
+
+
+class TilePaths(NamedTuple):
+    """The paths of a tile, with the selected paths first.
+
+    Attributes:
+      paths: light paths.
+      heaviest: whether a path is the heaviest of its ray.
+      count: number of selected paths.
+      dropped: dropped throughput of each ray.
+    """
+
+    paths: LightPaths
+    heaviest: Bool[Array, " paths"]
+    count: Int[Array, ""]  # type: ignore[assignment]  # hides tuple.count
+    dropped: Float[Array, "rays 3"]
+
+
+def render_rays(model: Model, rays: Rays) -> Rendering:
+    """Renders rays in one piece: a pure function, to be jitted or differentiated by the caller.
+
+    A trained model is in single precision, and so are its renderings.
+
+    Args:
+      model: trained model.
+      rays: camera rays `[n]`. They share the path buffers, so with few rays, throughput is dropped
+        sooner.
+    """
+    rays = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), rays)
+    detail = path_detail(model.config, model.settings)
+    traced = path_tracing.trace(model.scene, rays, settings=model.settings, detail=detail)
+    tile = sort_paths(traced, traced.dropped.shape[0])
+    sums = blank(tile.dropped)
+    return finish(add_paths(model.params, tile.paths, tile.heaviest, sums, config=model.config))
+
+
+def blank(dropped: Float[Array, "rays 3"]) -> Rendering:
+    """Returns the initial rendering, before any path is added."""
+    black = jnp.zeros_like(dropped)
+    zeros = black[:, 0]
+    return Rendering(black, zeros, zeros, zeros, linear=black, dropped=dropped)
+
+
+def sort_paths(
+    traced: Traced, real: int | Int[Array, ""], *, which: int | Int[Array, ""] = ALL
+) -> TilePaths:
+    """Moves the selected paths to the front and marks the heaviest path of each ray.
+
+    Args:
+      traced: traced paths of a tile.
+      real: number of rays in the tile that are not padding.
+      which: index of the selected branch in `BRANCHES`.
+    """
+    paths, rays = traced.paths, traced.dropped.shape[0]
+    branch = jnp.where(reflected_first(paths), _REFLECTED, _TRANSMITTED)
+    exists = light_paths.exists(paths) & (paths.rays < real)
+    exists &= (which == ALL) | (which == branch)
+    order = jnp.argsort(~exists, stable=True)
+    throughput = jnp.mean(paths.throughput, axis=-1)
+    most = jax.ops.segment_max(throughput, paths.rays, num_segments=rays)
+    heaviest = exists & (throughput >= most[paths.rays])
+    sorted_paths = jax.tree.map(lambda x: x[order], paths)
+    return TilePaths(sorted_paths, heaviest[order], jnp.sum(exists), traced.dropped)
+
+
+def add_paths(
+    params: Params,
+    paths: LightPaths,
+    heaviest: Bool[Array, " paths"],
+    sums: Rendering,
+    *,
+    config: ModelConfig,
+) -> Rendering:
+    """Adds some paths to the linear colours and distances of their rays."""
+    jitter = no_jitter(config, paths.radii.shape[0])
+    one = jnp.ones((), paths.radii.dtype)
+    seen = render_paths(params, config, paths, jitter, anneal=one).composite
+    paths = learned_media.attenuate(params.tints, paths, radius=config.radius)
+    share = jnp.mean(paths.throughput, axis=-1)
+    rays = sums.distance.shape[0]
+    # Writes to an index past the end are dropped.
+    target = jnp.where(heaviest, paths.rays, rays)
+    return sums._replace(
+        linear=sums.linear.at[paths.rays].add(paths.throughput * seen.rgb),
+        distance=sums.distance.at[target].set(seen.median, mode="drop"),
+        mean_distance=sums.mean_distance.at[target].set(seen.mean, mode="drop"),
+        accumulation=sums.accumulation.at[paths.rays].add(share * seen.accumulation),
+    )
+
+
+def finish(sums: Rendering) -> Rendering:
+    """Returns a rendering whose linear colours are complete, with their sRGB."""
+    return sums._replace(rgb=jnp.clip(linear_to_srgb(sums.linear), 0.0, 1.0))
+
+
+class BackdropEnds(NamedTuple):
+    """Where the light paths of rays end on a backdrop.
+
+    Attributes:
+      lookups: points of the backdrop; their pixels are the indices of the rays.
+      crossings: what learned tints read of the paths (`learned_media.crossings`).
+      hidden: whether a path meets something in front of the backdrop.
+      distances: arc length of each path up to the backdrop, world units; 0 in empty slots.
+    """
+
+    lookups: Lookups
+    crossings: Float[Array, "paths unknowns"]
+    hidden: Bool[Array, " paths"]
+    distances: Float[Array, " paths"]
+
+
+def backdrop_ends(
+    scene: Scene,
+    rays: Rays,
+    *,
+    settings: PathSettings,
+    domain: Domain,
+    resolution: int,
+    most_taps: int,
+    axes: int,
+    tally: Tally,
+    fields: tuple[int, ...],
+    faint: float | Float[Array, ""],
+) -> tuple[BackdropEnds, Float[Array, "rays 3"]]:
+    """Traces rays up to a backdrop.
+
+    Args:
+      scene: the scene.
+      rays: camera rays.
+      settings: path settings.
+      domain: scene bounds; their `space` is the kind of the backdrop.
+      resolution: number of cells per side of a face.
+      most_taps: largest number of taps along each axis of a ray's footprint.
+      axes: number of axes of the direction that the radiance depends on, 0 or 3.
+      tally: `parts` if tints and absorption are learned.
+      fields: parts whose inside is a field, which hides what is behind it.
+      faint: throughput below which a path has only one tap (`backdrop.locate`).
+
+    Returns:
+      The ends of the light paths, and the dropped throughput of each ray.
+    """
+    parts = scene.interfaces.index_inside.shape[0]
+    unknowns = 2 * parts if tally == "parts" else 0
+    if (unknowns or fields) and settings.max_bends:
+        # The first and the last segment are the fewest that can be stored.
+        detail = Detail("outside", 2, "differential", "parts")
+        traced = path_tracing.trace(scene, rays, settings=settings, detail=detail)
+        paths, ends = traced.paths, light_paths.ends_of(traced.paths)
+        crossings = learned_media.crossings(paths, radius=domain.radius)[:, :unknowns]
+        hidden = jnp.any(paths.path_lengths[:, jnp.asarray(fields, jnp.int32)] > 0.0, axis=1)
+        dropped = traced.dropped
+    else:
+        found = path_tracing.trace_ends(scene, rays, settings=settings, footprint="differential")
+        ends, dropped = found.ends, found.dropped
+        crossings = jnp.zeros((ends.rays.shape[0], unknowns), ends.tau.dtype)
+        hidden = jnp.zeros(ends.rays.shape, bool)
+    if ends.stop is not None:
+        hidden |= jnp.isfinite(ends.stop.tau)
+    exists = light_paths.exists(ends)
+    ends = ends._replace(throughput=jnp.where(exists[:, None], ends.throughput, 0.0))
+    locate = functools.partial(
+        backdrop.locate, resolution=resolution, most_taps=most_taps, axes=axes, faint=faint
+    )
+    lookups = locate(domain, ends, ends.rays)
+    leave = jax.vmap(functools.partial(scene_bounds.exit_distance, domain))
+    distances = jnp.where(exists, ends.tau + leave(ends.origins, ends.directions), 0.0)
+    return BackdropEnds(lookups, crossings, hidden, distances), dropped
 
 
 def random_jitter(key: Array, config: ModelConfig, slots: Int[Array, " paths"]) -> Jitter:

@@ -18,18 +18,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
-from refref_jax import numerics
 from refref_jax.choices import Space
 from refref_jax.geometry import cameras as cameras_module
 from refref_jax.geometry.cameras import Cameras
 from refref_jax.geometry.rays import Rays
 from refref_jax.numerics import host_array
-from refref_jax.optics import light_paths, path_tracing
 from refref_jax.optics.media import Scene
-from refref_jax.optics.path_settings import STRAIGHT, Detail, PathSettings, Tally
+from refref_jax.optics.path_settings import STRAIGHT, PathSettings, Tally
 from refref_jax.render import backdrop, images, learned_media, pixels
 from refref_jax.render.backdrop import Lookups, Mips, Pyramid
 from refref_jax.render.learned_media import LearnedTints
+from refref_jax.render.pixels import BackdropEnds
 from refref_jax.sampling.scene_bounds import Domain
 
 # One pixel in this many is held out.
@@ -76,61 +75,6 @@ class Unknowns(NamedTuple):
 
     levels: Pyramid
     gains: Float[Array, "views 1 1 3"]
-
-
-class _Seen(NamedTuple):
-    """What some rays see.
-
-    Attributes:
-      lookups: points of the surface that the light paths end on.
-      crossings: what learned tints read of the paths.
-      hidden: whether a path meets something in front of the surface.
-    """
-
-    lookups: Lookups
-    crossings: Float[Array, "paths unknowns"]
-    hidden: Bool[Array, " paths"]
-
-
-@functools.partial(
-    jax.jit,
-    static_argnames=("settings", "domain", "resolution", "most_taps", "axes", "tally", "fields"),
-)
-def _look(
-    scene: Scene,
-    rays: Rays,
-    *,
-    settings: PathSettings,
-    domain: Domain,
-    resolution: int,
-    most_taps: int,
-    axes: int,
-    tally: Tally,
-    fields: tuple[int, ...],
-) -> _Seen:
-    """Returns where the paths of rays end; their pixels are the indices of the rays."""
-    parts = scene.interfaces.index_inside.shape[0]
-    unknowns = 2 * parts if tally == "parts" else 0
-    if (unknowns or fields) and settings.max_bends:
-        # The first and the last segment are the fewest that can be stored.
-        detail = Detail("outside", 2, "differential", "parts")
-        paths = path_tracing.trace(scene, rays, settings=settings, detail=detail).paths
-        ends = light_paths.ends_of(paths)
-        crossings = learned_media.crossings(paths, radius=domain.radius)[:, :unknowns]
-        hidden = jnp.any(paths.path_lengths[:, jnp.asarray(fields, jnp.int32)] > 0.0, axis=1)
-    else:
-        traced = path_tracing.trace_ends(scene, rays, settings=settings, footprint="differential")
-        ends = traced.ends
-        crossings = jnp.zeros((ends.rays.shape[0], unknowns), ends.tau.dtype)
-        hidden = jnp.zeros(ends.rays.shape, bool)
-    if ends.stop is not None:
-        hidden |= jnp.isfinite(ends.stop.tau)
-    throughput = jnp.where(light_paths.exists(ends)[:, None], ends.throughput, 0.0)
-    ends = ends._replace(throughput=throughput)
-    lookups = backdrop.locate(
-        domain, ends, ends.rays, resolution=resolution, most_taps=most_taps, axes=axes
-    )
-    return _Seen(lookups, crossings, hidden)
 
 
 def read(
@@ -180,7 +124,7 @@ def read(
     tile = images.tile_for(min(group, len(photographs)) * rays_per_view)
 
     look = functools.partial(
-        _look,
+        images.backdrop_ends,
         scene,
         domain=domain,
         resolution=resolution,
@@ -188,10 +132,11 @@ def read(
         axes=axes,
         tally=tally,
         fields=fields,
+        faint=backdrop.FAINT,
     )
 
     def trace(views: Int[np.ndarray, " views"]) -> Block:
-        each: list[_Seen] = []
+        each: list[BackdropEnds] = []
         drawn = _drawn(len(views) * photographs[0, ..., 0].size, share, (draw, int(views[0])))
         drawn = drawn if among is None else drawn & among[views].reshape(-1)
         place = np.cumsum(drawn, dtype=np.int32) - 1
@@ -203,14 +148,11 @@ def read(
             met = np.isfinite(images.find_first_surface(scene.surfaces, rays).distances)
             for which, bends in ((kept & ~met, STRAIGHT), (kept & met, settings)):
                 chosen = jax.tree.map(lambda x, which=which: host_array(x[which]), rays)
-                each += _in_tiles(
-                    functools.partial(look, settings=bends), chosen, place[names[which]], tile
-                )
+                bent = functools.partial(look, settings=bends)
+                each += _in_tiles(bent, chosen, place[names[which]], tile, side**2)
             for _ in some:
                 progress(next(done), len(photographs))
         joined = jax.tree.map(lambda *parts: np.concatenate(parts), *each)
-        lookups = joined.lookups._replace(throughput=joined.lookups.throughput / side**2)
-        joined = joined._replace(lookups=lookups)
         block = _block(joined, photographs[views], views, drawn)
         if not np.any(joined.hidden):
             return block
@@ -219,6 +161,14 @@ def read(
 
     split = np.array_split(np.arange(len(photographs)), min(blocks, len(photographs)))
     return tuple(jax.device_put(block) for block in at_once(trace, split))
+
+
+def warm_up(levels: Pyramid, space: Space) -> None:
+    """Compiles what no pixel decides: the radiance at all resolutions, and its transpose.
+
+    XLA compiles a program on one core, so that this takes no time beside `read`.
+    """
+    jax.block_until_ready(_mipmap_transposed(images.mipmap(levels, space), space))
 
 
 def meets(scene: Scene, cameras: Cameras) -> Bool[np.ndarray, "views h w"]:
@@ -238,24 +188,31 @@ def _drawn(count: int, share: float, seed: tuple[int, int]) -> Bool[np.ndarray, 
 
 
 def _in_tiles(
-    look: Callable[[Rays], _Seen], rays: Rays, names: Int[np.ndarray, " rays"], tile: int
-) -> Iterator[_Seen]:
-    """Yields what rays see, tile by tile.
+    look: Callable[[Rays], tuple[BackdropEnds, Array]],
+    rays: Rays,
+    names: Int[np.ndarray, " rays"],
+    tile: int,
+    rays_per_pixel: int,
+) -> Iterator[BackdropEnds]:
+    """Yields where the paths of rays end, tile by tile.
 
     Args:
-      look: function that returns what the rays of a tile see.
+      look: function of the rays of a tile, `images.backdrop_ends`.
       rays: camera rays.
       names: pixel of each ray.
       tile: number of rays per tile.
+      rays_per_pixel: number of rays in each pixel, which share its light.
     """
     for first in range(0, names.size, tile):
         part, _ = images.crop(rays, None, first, tile)
-        seen = jax.device_get(look(part))
+        seen, _ = jax.device_get(look(part))
         # The last tile is filled up with rays that belong to no pixel.
         real = (seen.lookups.taps[:, 0] > 0) & (seen.lookups.pixels < names.size - first)
         seen = jax.tree.map(lambda x, real=real: x[real], seen)
         pixel = names[first + seen.lookups.pixels].astype(np.int32)
-        yield seen._replace(lookups=seen.lookups._replace(pixels=pixel))
+        throughput = seen.lookups.throughput / rays_per_pixel
+        lookups = seen.lookups._replace(pixels=pixel, throughput=throughput)
+        yield seen._replace(lookups=lookups)
 
 
 def at_once(function: Callable[..., _Result], *each: Sequence[Any]) -> list[_Result]:
@@ -265,7 +222,7 @@ def at_once(function: Callable[..., _Result], *each: Sequence[Any]) -> list[_Res
 
 
 def _block(
-    seen: _Seen,
+    seen: BackdropEnds,
     photographs: UInt8[np.ndarray, "views h w 3"],
     views: Int[np.ndarray, " views"],
     drawn: Bool[np.ndarray, " pixels"],
@@ -335,7 +292,7 @@ class System:
 
     def see(self, levels: Pyramid) -> list[Array]:
         """Returns the linear RGB of the pixels of each block, with the present gains."""
-        mips = mipmap(levels, self._space)
+        mips = images.mipmap(levels, self._space)
 
         def look(block: Block) -> Array:
             return jax.block_until_ready(_predict(mips, block))
@@ -421,12 +378,6 @@ def _sum_views(block: Block, values: Array, views: int) -> Float[Array, "views 3
 
 
 @functools.partial(jax.jit, static_argnames="space")
-def mipmap(pyramid: Pyramid, space: Space) -> Mips:
-    """Returns the radiance at all resolutions (`backdrop.mipmap`)."""
-    return backdrop.mipmap(pyramid, space)
-
-
-@functools.partial(jax.jit, static_argnames="space")
 def _mipmap_transposed(mips: Mips, space: Space) -> Pyramid:
     """Returns the transpose of `mipmap`."""
     like = tuple(jnp.zeros_like(mip) for mip in mips[::-1])
@@ -446,7 +397,7 @@ def _transposed(slopes: Array, block: Block, *, resolution: int) -> Mips:
 @jax.jit
 def _attenuated(block: Block, tints: LearnedTints) -> Block:
     """Returns the equations with the throughput that tints and absorption leave."""
-    dimmed = jnp.exp(numerics.product(-block.crossings, learned_media.densities(tints)))
+    dimmed = learned_media.transmittance(tints, block.crossings)
     lookups = block.lookups._replace(throughput=block.lookups.throughput * dimmed)
     return block._replace(lookups=lookups)
 

@@ -6,6 +6,7 @@ of a model with a field in front of it, whose steps `fit` takes afterwards.
 
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -138,7 +139,12 @@ class _Problem(NamedTuple):
     def iterate(self, run: Path, state: TrainState) -> Iterator[backdrop_solver.Progress]:
         """Yields the progress of the solver from a state on; at first, the coverage is written."""
         step, streams = int(state.step), self.share < 1.0
-        first = [self.equations(step // backdrop_solver.ROUND if streams else 0)]
+        with ThreadPoolExecutor(1) as beside:
+            compiled = beside.submit(
+                backdrop_equations.warm_up, self._uniform(), self.surface["space"]
+            )
+            first = [self.equations(step // backdrop_solver.ROUND if streams else 0)]
+            compiled.result()
         if not step:
             self._write_coverage(run, first[0], state)
 

@@ -33,7 +33,7 @@ from jaxtyping import Array, Float
 
 from refref_jax import numerics
 from refref_jax.choices import Space
-from refref_jax.render import backdrop, learned_media, pixels
+from refref_jax.render import backdrop, images, learned_media, pixels
 from refref_jax.render.backdrop import Mips, Pyramid
 from refref_jax.render.learned_media import LearnedTints
 from refref_jax.training import backdrop_equations
@@ -43,7 +43,6 @@ from refref_jax.training.backdrop_equations import (
     System,
     Unknowns,
     exposed,
-    mipmap,
     sum_of,
 )
 
@@ -323,7 +322,7 @@ def _round(
         _, before, typical = _measure(blocks, seen)
         if tints is not None:
             behind = tinted or [_tinted(block) for block in blocks]
-            brightened, mips = [exposed(b, gains) for b in behind], mipmap(levels, space)
+            brightened, mips = [exposed(b, gains) for b in behind], images.mipmap(levels, space)
             decay = known.tint_decay
             tints = _fit_tints(brightened, mips, tints, typical=typical, decay=decay)
     system = System(blocks, space, resolution, tints, gains)

@@ -15,8 +15,8 @@ from refref_jax.fields.base import DensityConfig, FieldKind, FieldSize, Radiance
 from refref_jax.optics.path_settings import STRAIGHT
 from refref_jax.render import checkpoint_io
 from refref_jax.render.checkpoint_io import SavedModel
-from refref_jax.render.images import render_rays
 from refref_jax.render.model import Model, init_params
+from refref_jax.render.pixels import render_rays
 from refref_jax.sampling.scene_bounds import Bounds
 from refref_jax.training.config import FieldConfig
 from refref_jax.training.presets import PRESETS, loss, override_model, samples_of

@@ -11,9 +11,11 @@ from benchmarks.oracles import colours
 from refref_jax.data.mesh_queries import parts_around
 from refref_jax.geometry import cameras
 from refref_jax.geometry.rays import Rays
+from refref_jax.optics import path_tracing
 from refref_jax.optics.path_settings import PAPER, STRAIGHT, TREE
 from refref_jax.render import (
     background_rendering,
+    images,
     radiance_of,
     render_known,
     render_known_camera,
@@ -202,9 +204,16 @@ _CAMERA = cameras.orbit(2, distance=4.0, elevation=0.3, size=12, angle_x=0.9)
 _TILE = 576
 
 
+def _rays(side, view=0):
+    """Returns the rays of an image: one in each square, row and column of a pixel."""
+    fine = cameras.supersample(_CAMERA, side)
+    row, column = np.indices((fine.height, fine.width))
+    up, right = (column % side + 0.5) / side - 0.5, (row % side + 0.5) / side - 0.5
+    return cameras.pixel_rays(fine, np.full(row.shape, view), row - up, column + right)
+
+
 def _uniform(scene, radiance, side, view=0):
-    rays = cameras.image_rays(cameras.supersample(_CAMERA, side), view)
-    seen = render_known(scene, radiance, rays, settings=TREE, tile=_TILE)
+    seen = render_known(scene, radiance, _rays(side, view), settings=TREE, tile=_TILE)
     return cameras.box_filter(seen.linear, side), seen.casts
 
 
@@ -222,14 +231,31 @@ def test_a_pixel_is_the_mean_of_its_rays(scene, view):
     assert seen.casts == casts and np.all(seen.rays == 4) and np.all(seen.dropped == 0.0)
 
 
+@pytest.mark.parametrize("side", [2, 4, 8])
+def test_an_edge_along_the_pixels_is_resolved_by_as_many_steps_as_there_are_rays(side):
+    ahead = cameras.Cameras(np.eye(4, dtype=np.float32)[None, :3], 1, 1, 1.0)
+    empty = refref_jax.assemble([])
+    shares = np.linspace(-0.4, 0.4, 23)
+
+    def half(edge, axis, origin, direction):
+        return jnp.full(3, jnp.where(direction[axis] > edge * -direction[2], 1.0, 0.0))
+
+    for axis in (0, 1):
+        for share in shares:
+            sky = jax.tree_util.Partial(half, jnp.float32(share), jnp.int32(axis))
+            seen = render_known_camera(
+                empty, sky, ahead, 0, settings=STRAIGHT, rays_per_pixel=side**2, tile=1024
+            )
+            assert abs(seen.linear[0, 0, 0] - (0.5 - share)) <= 0.5 / side**2 + 1e-6
+
+
 def _stripes(origin, direction):
     return jnp.where(jnp.sin(4.0 * direction[2]) > 0.0, 0.9, 0.1) + 0.0 * origin
 
 
 def test_pixels_whose_rays_differ_from_neighbours_get_more_rays(scene):
     seen = _image(scene, _stripes, refined_rays_per_pixel=25, tolerance=0.2)
-    rays = cameras.image_rays(cameras.supersample(_CAMERA, 2), 0)
-    first = render_known(scene, _stripes, rays, settings=TREE, tile=_TILE).rgb
+    first = render_known(scene, _stripes, _rays(2), settings=TREE, tile=_TILE).rgb
     high, low = (f(first, (3, 3, 1), mode="nearest") for f in (maximum_filter, minimum_filter))
     contrast = (high - low).reshape(12, 2, 12, 2, 3).max(axis=(1, 3, 4))
     clear = np.abs(contrast - 0.2) > 1e-5  # of rounding
@@ -258,10 +284,36 @@ def test_white_is_not_refined_and_zero_tolerance_refines_what_differs(scene):
     np.testing.assert_allclose(seen.linear, _uniform(scene, _environment(), 3)[0], atol=1e-5)
 
 
+def test_pixels_that_show_the_background_alone_may_have_more_rays(scene):
+    seen = _image(scene, _stripes, background_rays_per_pixel=25, refined_rays_per_pixel=9)
+    hits = np.isfinite(images.find_first_surface(scene.surfaces, _rays(2)).distances)
+    near = maximum_filter(hits.reshape(12, 2, 12, 2).any(axis=(1, 3)), 3, mode="constant")
+    assert 0.1 < near.mean() < 0.9
+    np.testing.assert_array_equal(seen.rays == 25, ~near)
+    assert set(np.unique(seen.rays)) == {4, 9, 25}
+    by_count = [_uniform(scene, _stripes, side)[0] for side in (2, 3, 5)]
+    expected = np.select([seen.rays[..., None] == count for count in (4, 9, 25)], by_count)
+    np.testing.assert_allclose(seen.linear, expected, atol=1e-5)
+
+
+def test_a_tile_whose_paths_do_not_fit_is_rendered_in_halves(scene, rays):
+    scarce = dataclasses.replace(TREE, live_per_ray=1.0, segments_per_ray=6.0, paths_per_ray=2.0)
+    met = np.isfinite(images.find_first_surface(scene.surfaces, rays).distances)
+    hits = jax.tree.map(lambda x: np.resize(x[met], (1024, *x.shape[rays.radii.ndim :])), rays)
+    once = path_tracing.trace_ends(scene, hits, settings=scarce)
+    assert np.sum(once.dropped) > 0.0
+    seen = render_known(scene, _environment(), hits, settings=scarce, tile=1024)
+    assert np.sum(seen.dropped) == 0.0
+    roomy = render_known(scene, _environment(), hits, settings=TREE, tile=1024)
+    np.testing.assert_allclose(seen.linear, roomy.linear, atol=1e-5)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"rays_per_pixel": 5}, "square grid"),
+        ({"background_rays_per_pixel": 5}, "square grid"),
+        ({"background_rays_per_pixel": 4}, "background_rays_per_pixel is 4"),
         ({"refined_rays_per_pixel": 5}, "square grid"),
         ({"rays_per_pixel": 9, "refined_rays_per_pixel": 9}, "refined_rays_per_pixel is 9"),
         ({"rays_per_pixel": 9, "refined_rays_per_pixel": 4}, "refined_rays_per_pixel is 4"),

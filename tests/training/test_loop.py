@@ -3,6 +3,7 @@ import functools
 import itertools
 import json
 import shutil
+import time
 import types
 from typing import Any, NamedTuple
 
@@ -62,6 +63,15 @@ def _assert_identical(a, b):
     assert tree_a == tree_b
     for x, y in zip(leaves_a, leaves_b, strict=True):
         np.testing.assert_array_equal(x, y)
+
+
+def test_checkpoints_are_written_while_the_clock_jumps(tmp_path, monkeypatch):
+    state, jumps, now = _start(), np.random.default_rng(0), time.time
+    monkeypatch.setattr(time, "time", lambda: now() + jumps.uniform(-1e6, 1e6))
+    with Checkpoints(tmp_path, keep=2) as checkpoints:
+        for step in range(6):
+            checkpoints.save(state._replace(step=jnp.int32(step)))
+        _assert_identical(checkpoints.restore(_start()), state._replace(step=jnp.int32(5)))
 
 
 # Within a pool, and between two.

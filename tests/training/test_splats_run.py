@@ -13,7 +13,7 @@ from experiments.viewer import cameras as viewing
 from experiments.viewer import layers, session
 from refref_jax.data import image_files, scene_folder
 from refref_jax.geometry.cameras import image_rays
-from refref_jax.render import checkpoint_io, images
+from refref_jax.render import checkpoint_io, images, pixels
 from refref_jax.render.model import look_up
 from refref_jax.splats.gaussians import Gaussians, read_ply
 from refref_jax.training import fit, presets, run_folder
@@ -112,7 +112,7 @@ def test_the_viewer_draws_the_error_of_a_test_view(trained):
 def test_what_needs_rays_or_a_field_is_refused_in_one_sentence(trained):
     model = trained[0]
     rays = image_rays(CAMERAS, 0)
-    for render in (images.render_image, images.render_rays):
+    for render in (images.render_image, pixels.render_rays):
         with pytest.raises(ValueError, match=r"Gaussian splats, which are seen by cameras"):
             render(model, jax.tree.map(lambda x: x[0], rays))
     with pytest.raises(ValueError, match=r"no density to look up\. Train it with field=zipnerf"):
