@@ -11,6 +11,8 @@ from refref_jax.render import backdrop
 from refref_jax.sampling.scene_bounds import Domain
 from tests.factories import lit_scenes, revolved
 
+_mipmap = jax.jit(backdrop.mipmap, static_argnames="space")
+
 
 def bottle():
     """A bottle, 2.6 high."""
@@ -29,7 +31,7 @@ def smooth_backdrop():
         jnp.asarray(level + size * random.normal(size=level.shape), jnp.float32)
         for level, size in zip(pyramid, (0.12, 0.12, 0.08, 0.04), strict=True)
     ]
-    mips = backdrop.mipmap(tuple(jnp.maximum(level, -0.1) for level in levels), "bounded")
+    mips = _mipmap(tuple(jnp.maximum(level, -0.1) for level in levels), space="bounded")
     return Backdrop(Domain(8.0, "bounded"), mips, tuple(jnp.ones_like(mip) for mip in mips))
 
 

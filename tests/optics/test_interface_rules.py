@@ -1,3 +1,5 @@
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -107,6 +109,11 @@ def test_the_ambient_medium_is_outside_all_parts(rule, outside):
     assert interface_rules.ambient_of(interfaces) == 1.25
 
 
+_trace_ends = jax.jit(
+    functools.partial(path_tracing.trace_ends, settings=make_path_settings("tree"))
+)
+
+
 @pytest.mark.parametrize("rule", interface_rules.RULES)
 def test_only_the_ratio_of_indices_bends_light(rule):
     parts = [
@@ -122,11 +129,7 @@ def test_only_the_ratio_of_indices_bends_light(rule):
     origins = np.stack([np.full(12, -3.0), heights, np.full(12, 0.1)], axis=-1)
     directions = np.tile([1.0, 0.0, 0.0], (12, 1))
     rays = Rays(*(jnp.asarray(x, jnp.float32) for x in (origins, directions, np.full(12, 1e-3))))
-    settings = make_path_settings("tree")
-    ours, same, different = (
-        path_tracing.trace_ends(scene, rays, settings=settings).ends
-        for scene in (in_air, immersed, other)
-    )
+    ours, same, different = (_trace_ends(scene, rays).ends for scene in (in_air, immersed, other))
     close = {"rtol": 1e-3, "atol": 1e-3}
     np.testing.assert_allclose(ours.directions, same.directions, **close)
     np.testing.assert_allclose(ours.throughput, same.throughput, **close)

@@ -364,10 +364,8 @@ def test_dispersed_rays_may_start_inside_parts(rule):
         empty_interior_list(scene.interfaces), (2, interior_length(scene.interfaces))
     )
     rays = _rays(0.1, 0.2)
-    given = trace(scene, rays, settings=TREE, interior_list=lists).paths
-    np.testing.assert_array_equal(
-        given.throughput, trace(scene, rays, settings=TREE).paths.throughput
-    )
+    given = _trace(scene, rays, settings=TREE, interior_list=lists).paths
+    np.testing.assert_array_equal(given.throughput, _paths(scene, rays).throughput)
 
 
 def test_the_share_of_rays_that_hit_counts_rays_not_colours():

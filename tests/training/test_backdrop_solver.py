@@ -26,6 +26,7 @@ from tests.factories import scenes
 _RESOLUTION = 16
 _SKY = Domain(1.0, "unbounded")
 _TREE = dataclasses.replace(TREE, max_bends=5)
+_mipmap = jax.jit(backdrop.mipmap, static_argnames="space")
 
 
 def _environment(brightness=1.0):
@@ -117,7 +118,7 @@ def test_an_environment_is_recovered_through_glass(ball):
     other = cameras.orbit(1, distance=3.0, elevation=0.1, size=24, angle_x=1.2)
     image = _photographs(ball, sky, other, _TREE)
     (block,) = _equations(ball, other, image, settings=_TREE, side=2)
-    mips = backdrop.mipmap(last.pyramid, "unbounded")
+    mips = _mipmap(last.pyramid, space="unbounded")
     seen = pixels.linear_to_srgb(backdrop.colours(mips, block.lookups, pixels=24**2))
     assert np.sqrt(np.mean((seen - block.srgb) ** 2)) < 0.012
 
@@ -164,7 +165,7 @@ def _one_pixel(srgb, *, throughput=1.0, kept=1.0):
 def test_one_vertex_seen_by_one_pixel_continues_everywhere():
     last = _solve([_one_pixel(0.5)])
     expected = float(pixels.srgb_to_linear(jnp.float32(0.5)))
-    for copy in backdrop.mipmap(last.pyramid, "unbounded"):
+    for copy in _mipmap(last.pyramid, space="unbounded"):
         np.testing.assert_allclose(copy, expected, rtol=1e-3)
 
 
@@ -181,7 +182,7 @@ def test_saturated_pixels_bound_the_radiance_from_below():
     white, dimmed = _one_pixel(1.0), _one_pixel(0.5, throughput=0.05)
     last = _solve([white, dimmed], iterations=32)
     expected = float(pixels.srgb_to_linear(jnp.float32(0.5))) / 0.05
-    middle = backdrop.mipmap(last.pyramid, "unbounded")[0][0, 8, 8]
+    middle = _mipmap(last.pyramid, space="unbounded")[0][0, 8, 8]
     assert expected > 4.0
     np.testing.assert_allclose(middle, expected, rtol=0.05)
 
@@ -189,7 +190,7 @@ def test_saturated_pixels_bound_the_radiance_from_below():
 def test_pixels_that_are_held_out_have_no_weight():
     last = _solve([_one_pixel(0.5), _one_pixel(0.9, kept=0.0)])
     expected = float(pixels.srgb_to_linear(jnp.float32(0.5)))
-    middle = backdrop.mipmap(last.pyramid, "unbounded")[0][0, 8, 8]
+    middle = _mipmap(last.pyramid, space="unbounded")[0][0, 8, 8]
     np.testing.assert_allclose(middle, expected, rtol=1e-3)
 
 

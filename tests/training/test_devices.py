@@ -1,5 +1,6 @@
 """Training on several devices, and in several processes, is training on one."""
 
+import functools
 import json
 import os
 import socket
@@ -107,7 +108,7 @@ def test_one_process_agrees_with_itself():
 @pytest.mark.parametrize(("multiple", "room"), [(1, 3), (3, 3), (2, 4), (8, 8), (16, 16)])
 def test_lists_are_filled_up_with_empty_slots(multiple, room):
     paths = made_paths.stack([made_paths.random_path(i, bends=1, segments=3) for i in range(3)])
-    filled = light_paths.filled_up(paths, multiple=multiple)
+    filled = jax.jit(functools.partial(light_paths.filled_up, multiple=multiple))(paths)
     assert filled.radii.shape == (room,)
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[:3], b), filled, paths)
     assert (filled.statuses[3:] == PathStatus.EMPTY).all() and not np.any(filled.throughput[3:])

@@ -1,7 +1,9 @@
 """Exported backdrops against rays that a stranger casts and textures that are read again."""
 
 import dataclasses
+import functools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -39,16 +41,16 @@ def _seen(model, domain, directions):
     """Returns the linear RGB that rays from the centre see."""
     count = len(directions)
     origins = np.broadcast_to(np.asarray(domain.centre), (count, 3))
-    rays = Rays(*(jnp.asarray(x, jnp.float32) for x in (origins, directions, np.zeros(count))))
-    lookups = backdrop.locate(
-        domain,
-        light_paths.straight_ends(rays),
-        jnp.arange(count, dtype=jnp.int32),
-        resolution=_SIDE,
-        most_taps=1,
-    )
-    mips = backdrop.mipmap(model.params.field, domain.space)
-    return np.asarray(backdrop.radiance(mips, lookups))
+    rays = Rays(*(np.asarray(x, np.float32) for x in (origins, directions, np.zeros(count))))
+    return np.asarray(_look(model.params.field, rays, domain=domain))
+
+
+@functools.partial(jax.jit, static_argnames="domain")
+def _look(pyramid, rays, *, domain):
+    numbers = jnp.arange(len(rays.radii), dtype=jnp.int32)
+    ends = light_paths.straight_ends(rays)
+    lookups = backdrop.locate(domain, ends, numbers, resolution=_SIDE, most_taps=1)
+    return backdrop.radiance(backdrop.mipmap(pyramid, domain.space), lookups)
 
 
 def _directions(count=400):
