@@ -144,8 +144,7 @@ def render_known(
     render = functools.partial(_in_tiles, scene, radiance, tile=tile)
     if interior_list is not None or settings.max_bends == 0:
         return render(rays, interior_list, settings=settings)
-    rays = images.fetch(rays, instead=_INSTEAD)
-    met, hits, misses = images.split_by_hit(scene.surfaces, rays, tile=tile)
+    met, hits, misses = images.split_by_hit(scene.surfaces, rays, tile=tile, instead=_INSTEAD)
     bent, straight = render(hits, None, settings=settings), render(misses, None, settings=STRAIGHT)
     pairs = zip(bent[:-1], straight[:-1], strict=True)
     rgb, linear, paths, dropped = (images.merged(met, *each) for each in pairs)

@@ -44,8 +44,7 @@ from refref_jax.render.pixels import ALL, BRANCHES, BackdropEnds, TilePaths
 # leave the capacity of the path buffers to the other rays.
 _OUT_OF_REACH = 1e9
 
-# Smaller tiles would have too little capacity for the paths of a ray.
-_SMALLEST_TILE = 1024
+_SMALLEST_TILE = 1024  # smaller ones would have too little capacity for the paths of a ray
 
 _Tree = TypeVar("_Tree")
 
@@ -56,7 +55,6 @@ CHUNK = 4096
 """Number of paths rendered at once on a CPU; see `on_this_device`."""
 
 _FEWEST = 16  # parts of a tile below which it is not halved again
-
 # An accelerator takes as many times the rays and paths, since the host waits for each tile.
 _TIMES = 16
 
@@ -266,9 +264,11 @@ def _render_backdrop(model: Model, rays: Rays, nothing: Rendering) -> Rendering:
 
 
 def split_by_hit(
-    surfaces: Surfaces | LevelSet, rays: Rays, *, tile: int | None = None
+    surfaces: Surfaces | LevelSet, rays: Rays, *, tile: int | None = None, instead: str = _INSTEAD
 ) -> tuple[Bool[np.ndarray, "*rays"], Rays, Rays]:
     """Returns which rays meet an object, these rays and the others; `merged` joins their values."""
+    traced = [x for x in jax.tree.leaves(surfaces) if isinstance(x, jax.core.Tracer)]
+    rays, _ = fetch((rays, traced), instead=instead)
     met = np.isfinite(find_first_surface(surfaces, rays, tile=tile).distances)
     return met, _of(rays, met), _of(rays, ~met)
 

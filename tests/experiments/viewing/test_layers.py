@@ -16,6 +16,7 @@ from refref_jax.geometry.cameras import image_rays
 from refref_jax.optics.interface_rules import RULES
 from refref_jax.optics.path_settings import PAPER, STRAIGHT
 from refref_jax.render import Model, images, init_params, render_image
+from refref_jax.render import pixels as rendering
 from tests.factories import scenes
 from tests.factories.small_model import CAMERAS, MODEL
 
@@ -32,7 +33,7 @@ def model():
 
 
 def _blank():
-    return images._blank(jnp.zeros((0, 3)))
+    return rendering.blank(jnp.zeros((0, 3)))
 
 
 def test_a_model_offers_what_it_has(model):
