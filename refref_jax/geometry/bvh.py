@@ -258,17 +258,17 @@ def closest_hits(
 
 
 def _traverse(*arguments: Array) -> tuple[Float[Array, " rays"], Int[Array, " rays"]]:
-    """Traverses the tree as the kind of device that it is compiled for does it best."""
+    """Traverses the tree in the way that suits the device that it is compiled for."""
     from refref_jax.geometry import traversal  # which reads the nodes of this module
 
     if compilation.chosen_traversal() == "warp":
         warp = traversal.trace_in_warp
         return jax.lax.platform_dependent(*arguments, cpu=warp, cuda=warp, default=_closest_by_ray)
-    return _as_platform_likes(*arguments)
+    return _by_platform(*arguments)
 
 
 def _closest_by_ray(*arguments: Array) -> tuple[Float[Array, " rays"], Int[Array, " rays"]]:
-    """Traces all rays, each by itself."""
+    """Casts all rays, each by itself."""
     from refref_jax.geometry import traversal  # which reads the nodes of this module
 
     return jax.vmap(traversal.trace_ray, in_axes=(None, None, 0, 0, 0, 0))(*arguments)
@@ -338,7 +338,7 @@ def _closest_in_packets(
     return jax.tree.map(lambda x: x.reshape(-1)[:count], tuple(closest))
 
 
-_as_platform_likes = compilation.chosen_by_platform(
+_by_platform = compilation.chosen_by_platform(
     "closest_hits", cpu=_closest_in_packets, default=_closest_by_ray, like=lambda *query: query[4:]
 )
 

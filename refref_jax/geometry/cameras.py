@@ -43,7 +43,7 @@ def pixel_rays(
     row: Real[np.ndarray, "*shape"],
     column: Real[np.ndarray, "*shape"],
 ) -> Rays:
-    """Returns the rays through pixel centres, or places beside them, in single precision.
+    """Returns the rays through pixel centres, or other points of pixels, in single precision.
 
     The radius of a ray is that of a cone with the solid angle of the pixel, scaled so that a disc
     of this radius has the variance of the pixel (mip-NeRF: `2 / sqrt(12)` of its width).
@@ -51,8 +51,8 @@ def pixel_rays(
     Args:
       cameras: the cameras.
       camera: index of the camera of each ray.
-      row: pixel row, 0 at the top; half a pixel more is its lower edge.
-      column: pixel column, 0 at the left; half a pixel more is its right edge.
+      row: pixel row, 0 at the top; a fraction is an offset down from the pixel's centre.
+      column: pixel column, 0 at the left; a fraction is an offset to the right.
     """
     towards, cosine = _unit_directions(cameras, row, column)
     pose = cameras.poses[camera]

@@ -300,6 +300,25 @@ Branch = Literal["both", "transmitted", "reflected"]
 """Paths to select: both branches, `reflected` ones, or `transmitted` ones (all others)."""
 
 
+def heaviest(
+    share: Float[Array, " paths"],
+    of_rays: Int[Array, " paths"],
+    exists: Bool[Array, " paths"],
+    *,
+    rays: int,
+) -> Bool[Array, " paths"]:
+    """Returns which paths carry the most light of their ray; several, if they carry as much.
+
+    Args:
+      share: throughput of each path, mean over RGB.
+      of_rays: index of each path's ray.
+      exists: whether a slot holds a path.
+      rays: number of rays.
+    """
+    most = jax.ops.segment_max(share, of_rays, num_segments=rays)
+    return exists & (share >= most[of_rays])
+
+
 def reflected_first(paths: LightPaths) -> Bool[Array, " paths"]:
     """Returns which paths were reflected at the first surface they hit.
 

@@ -35,7 +35,7 @@ from refref_jax.render.backgrounds import Radiance
 TILE = 65536
 """Largest number of rays traced at once."""
 
-# Number of tiles of an image whose rays all meet an object, if they are small enough.
+# Number of tiles of an image that is full of glass, if larger ones are allowed.
 _TILES = 4
 
 _INSTEAD = (
@@ -58,7 +58,7 @@ class KnownRendering(NamedTuple):
       paths: number of light paths of each ray.
       dropped: dropped throughput of each ray, because a path buffer was full or truncated paths are
         black.
-      casts: total number of closest-hit queries; what tells which rays to trace is not counted.
+      casts: total number of closest-hit queries along paths.
     """
 
     rgb: Float[np.ndarray, "*rays 3"]
@@ -137,7 +137,7 @@ def render_known(
     """
     if tile < 1:
         raise ValueError(f"tile is {tile}, but a tile needs rays. Give 1 or more.")
-    # Of all rays of an image, a part meets glass; this size is the same for all images of a size.
+    # A part of an image meets glass. All images of one size have the same tiles, and one program.
     tile = images.size_for(-(-rays.radii.size // _TILES), most=tile)
     # Transferred to the device once, not once per tile.
     scene, radiance = jax.device_put((scene, _as_argument(radiance)))

@@ -30,7 +30,7 @@ from refref_jax.geometry.cameras import Cameras, box_filter, pixel_rays, supersa
 from refref_jax.geometry.rays import Rays
 from refref_jax.geometry.surfaces import LevelSet, Surfaces, closest, meet, surface_point
 from refref_jax.numerics import host_array
-from refref_jax.optics import path_tracing
+from refref_jax.optics import light_paths, path_tracing
 from refref_jax.optics.light_paths import Branch
 from refref_jax.optics.media import EMPTY_SLOT, Scene
 from refref_jax.optics.path_settings import STRAIGHT, Detail, PathSettings
@@ -54,7 +54,7 @@ TILE = 16384
 CHUNK = 4096
 """Number of paths rendered at once on a CPU; see `on_this_device`."""
 
-_FEWEST = 16  # parts of a tile below which it is not halved again
+_MOST_PARTS = 16  # that a tile is divided into, if its paths do not fit the buffers
 # An accelerator takes as many times the rays and paths, since the host waits for each tile.
 _TIMES = 16
 
@@ -99,8 +99,8 @@ def in_tiles(
     """
     rays, interior_list = fetch((rays, interior_list), instead=instead)
     shape, count = rays.radii.shape, rays.radii.size
-    ends = len(shape)
-    flat, listed = jax.tree.map(lambda x: x.reshape(-1, *x.shape[ends:]), (rays, interior_list))
+    axes = len(shape)
+    flat, listed = jax.tree.map(lambda x: x.reshape(-1, *x.shape[axes:]), (rays, interior_list))
     parts = [
         _see_tile(see, *crop(flat, listed, start, tile), min(tile, count - start), instead)
         for start in range(0, count, tile)
@@ -115,18 +115,18 @@ def _see_tile(
     """Renders a tile; in halves, if light was dropped because its paths did not fit the buffers."""
     seen = fetch(see(rays, listed, real), instead=instead)
     lost, tile, half = np.sum(getattr(seen, "dropped", 0.0)), rays.radii.size, -(-real // 2)
-    if not lost or real <= tile // _FEWEST:
+    if not lost or real <= tile // _MOST_PARTS:
         return seen
     first, second = (
-        _see_tile(see, *crop(*_of((rays, listed), part), 0, tile), count, instead)
+        _see_tile(see, *crop(*_select((rays, listed), part), 0, tile), count, instead)
         for part, count in ((slice(half), half), (slice(half, real), real - half))
     )
-    whole = join([_of(first, slice(half)), _of(second, slice(tile - half))])
+    whole = join([_select(first, slice(half)), _select(second, slice(tile - half))])
     # Truncated paths that are black are dropped, too: fewer rays at once do not help.
     return whole if np.sum(whole.dropped) < lost else seen
 
 
-def _of(tree: _Tree, which: Any) -> _Tree:
+def _select(tree: _Tree, which: Any) -> _Tree:
     """Returns some of the values of all arrays of a pytree."""
     return jax.tree.map(lambda x: host_array(x[which]), tree)
 
@@ -270,7 +270,7 @@ def split_by_hit(
     traced = [x for x in jax.tree.leaves(surfaces) if isinstance(x, jax.core.Tracer)]
     rays, _ = fetch((rays, traced), instead=instead)
     met = np.isfinite(find_first_surface(surfaces, rays, tile=tile).distances)
-    return met, _of(rays, met), _of(rays, ~met)
+    return met, _select(rays, met), _select(rays, ~met)
 
 
 def merged(met: np.ndarray, some: np.ndarray, others: np.ndarray) -> np.ndarray:
@@ -287,8 +287,7 @@ def _of_backdrop(
     """Renders rays in front of a backdrop, given its mipmap and the ends of their paths."""
     lookups, count = ends.lookups, dropped.shape[0]
     share = jnp.mean(lookups.throughput, axis=-1)
-    most = jax.ops.segment_max(share, lookups.pixels, num_segments=count)
-    heaviest = (ends.distances > 0.0) & (share >= most[lookups.pixels])
+    heaviest = light_paths.heaviest(share, lookups.pixels, ends.distances > 0.0, rays=count)
     if params.tints is not None:
         left = learned_media.transmittance(params.tints, ends.crossings)
         lookups = lookups._replace(throughput=lookups.throughput * left)

@@ -97,7 +97,7 @@ def attenuate(learned: LearnedTints | None, paths: LightPaths, *, radius: float)
 def transmittance(
     learned: LearnedTints, crossed: Float[Array, "paths unknowns"]
 ) -> Float[Array, "paths 3"]:
-    """Returns what tints and absorption leave of paths, given their `crossings`; linear RGB."""
+    """Returns the transmittance of paths through tints and media, linear RGB, from `crossings`."""
     return jnp.exp(numerics.product(-crossed, densities(learned)))
 
 

@@ -137,7 +137,7 @@ class ModelConfig:
       field_parts: parts whose inside is sampled too, where `interior` leaves out the others.
       centre: centre of the cube or ball, world units; it is the centre of the fields' unit cube.
       backdrop: surface behind the objects that takes the place of the field around them, or `None`.
-      last_sample: where the field is evaluated for the last, opaque interval: in its `middle`,
+      last_sample: place at which the field of the last, opaque interval is evaluated: its `middle`,
         as in models of earlier versions, or at the `end` of the path, which is on a surface if the
         scene is bounded or spherical; if it is unbounded, always in the middle.
       splats: Gaussians that take the place of all fields, or `None`.

@@ -27,7 +27,7 @@ from refref_jax.geometry.cameras import Cameras, image_rays
 from refref_jax.geometry.rays import Rays
 from refref_jax.numerics import host_array
 from refref_jax.optics import light_paths, path_tracing
-from refref_jax.optics.light_paths import Branch, LightPaths, PathStatus, reflected_first
+from refref_jax.optics.light_paths import Branch, LightPaths, PathEnds, PathStatus, reflected_first
 from refref_jax.optics.media import Scene
 from refref_jax.optics.path_settings import Detail, PathSettings, Tally
 from refref_jax.optics.path_tracing import Traced
@@ -164,14 +164,19 @@ def _see_backdrop(params: Params, config: ModelConfig, paths: LightPaths) -> Com
     if has_foreground(config):  # only the field in front of it is trained
         surface = jax.lax.stop_gradient(surface)
     mips = backdrop.mipmap(surface, config.space)
-    leave = jax.vmap(functools.partial(scene_bounds.exit_distance, bounds))
-    distance = ends.tau + leave(ends.origins, ends.directions)
+    distance = _up_to_bounds(bounds, ends)
     return Composite(
         rgb=backdrop.radiance(mips, lookups),
         accumulation=jnp.ones_like(paths.radii),
         median=distance,
         mean=distance,
     )
+
+
+def _up_to_bounds(domain: Domain, ends: PathEnds) -> Float[Array, " paths"]:
+    """Returns the arc length of paths from the camera to the scene bounds."""
+    leave = jax.vmap(functools.partial(scene_bounds.exit_distance, domain))
+    return ends.tau + leave(ends.origins, ends.directions)
 
 
 class TilePaths(NamedTuple):
@@ -203,8 +208,7 @@ def render_rays(model: Model, rays: Rays) -> Rendering:
     rays = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), rays)
     detail = path_detail(model.config, model.settings)
     traced = path_tracing.trace(model.scene, rays, settings=model.settings, detail=detail)
-    tile = sort_paths(traced, traced.dropped.shape[0])
-    sums = blank(tile.dropped)
+    tile, sums = sort_paths(traced, traced.dropped.shape[0]), blank(traced.dropped)
     return finish(add_paths(model.params, tile.paths, tile.heaviest, sums, config=model.config))
 
 
@@ -230,9 +234,8 @@ def sort_paths(
     exists = light_paths.exists(paths) & (paths.rays < real)
     exists &= (which == ALL) | (which == branch)
     order = jnp.argsort(~exists, stable=True)
-    throughput = jnp.mean(paths.throughput, axis=-1)
-    most = jax.ops.segment_max(throughput, paths.rays, num_segments=rays)
-    heaviest = exists & (throughput >= most[paths.rays])
+    share = jnp.mean(paths.throughput, axis=-1)
+    heaviest = light_paths.heaviest(share, paths.rays, exists, rays=rays)
     sorted_paths = jax.tree.map(lambda x: x[order], paths)
     return TilePaths(sorted_paths, heaviest[order], jnp.sum(exists), traced.dropped)
 
@@ -272,7 +275,7 @@ class BackdropEnds(NamedTuple):
 
     Attributes:
       lookups: points of the backdrop; their pixels are the indices of the rays.
-      crossings: what learned tints read of the paths (`learned_media.crossings`).
+      crossings: hits and lengths per part, for learned tints (`learned_media.crossings`).
       hidden: whether a path meets something in front of the backdrop.
       distances: arc length of each path up to the backdrop, world units; 0 in empty slots.
     """
@@ -332,12 +335,9 @@ def backdrop_ends(
         hidden |= jnp.isfinite(ends.stop.tau)
     exists = light_paths.exists(ends)
     ends = ends._replace(throughput=jnp.where(exists[:, None], ends.throughput, 0.0))
-    locate = functools.partial(
-        backdrop.locate, resolution=resolution, most_taps=most_taps, axes=axes, faint=faint
-    )
-    lookups = locate(domain, ends, ends.rays)
-    leave = jax.vmap(functools.partial(scene_bounds.exit_distance, domain))
-    distances = jnp.where(exists, ends.tau + leave(ends.origins, ends.directions), 0.0)
+    locate = functools.partial(backdrop.locate, resolution=resolution, most_taps=most_taps)
+    lookups = locate(domain, ends, ends.rays, axes=axes, faint=faint)
+    distances = jnp.where(exists, _up_to_bounds(domain, ends), 0.0)
     return BackdropEnds(lookups, crossings, hidden, distances), dropped
 
 

@@ -49,7 +49,7 @@ class Block(NamedTuple):
 
     Attributes:
       lookups: points of the surface that the views' light paths end on.
-      crossings: what learned tints read of the paths (`learned_media.crossings`), if there are any.
+      crossings: hits and lengths per part (`learned_media.crossings`), if tints are learned.
       linear: linear RGB of the pixels.
       srgb: sRGB of the pixels.
       kept: weight of the pixels: 1 if they are fitted, 0 if they are held out.
@@ -164,9 +164,9 @@ def read(
 
 
 def warm_up(levels: Pyramid, space: Space) -> None:
-    """Compiles what no pixel decides: the radiance at all resolutions, and its transpose.
+    """Compiles the mipmap and its transpose, whose shapes do not depend on the pixels.
 
-    XLA compiles a program on one core, so that this takes no time beside `read`.
+    XLA compiles a program on one core, so that this costs no time beside `read`.
     """
     jax.block_until_ready(_mipmap_transposed(images.mipmap(levels, space), space))
 

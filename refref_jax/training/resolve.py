@@ -73,7 +73,7 @@ class SceneFacts(NamedTuple):
       origins: names of the files that define properties, by their keys in scene.json.
       source: reason for `half_extent` and `centre`.
       centre: centre of the background, in scene.json, given or measured.
-      stated: what states the kind of the background, such as `scene.json`; empty if nothing does.
+      stated: source of the kind of the background, such as `scene.json`; empty without one.
       misfits: function of space, size and centre to `scene_analysis.misfits` of the scene's images.
     """
 

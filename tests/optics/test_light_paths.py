@@ -10,7 +10,7 @@ import pytest
 
 from refref_jax.optics import path_tracing
 from refref_jax.optics.differentiable_paths import follow_branch
-from refref_jax.optics.light_paths import PathStatus, exists, reflected_first, straight
+from refref_jax.optics.light_paths import PathStatus, exists, heaviest, reflected_first, straight
 from refref_jax.optics.path_settings import TREE
 from tests.factories import made_paths, scenes
 
@@ -66,3 +66,13 @@ def test_the_tree_s_reflected_paths_set_out_as_the_single_reflection_does():
             np.testing.assert_allclose(
                 ours, np.broadcast_to(branch.directions[1], ours.shape), atol=1e-5
             )
+
+
+def test_the_heaviest_paths_of_rays():
+    of_rays = jnp.array([0, 0, 2, 2, 2, 3, 0], jnp.int32)
+    share = jnp.array([0.2, 0.7, 0.5, 0.5, 0.1, 0.0, 0.9], jnp.float32)
+    held = jnp.array([1, 1, 1, 1, 1, 1, 0], bool)
+    share = jnp.where(held, share, 0.0)
+    found = heaviest(share, of_rays, held, rays=4)
+    # Equal ones both count, one without light counts alone, and an empty slot never does.
+    assert found.tolist() == [False, True, True, True, False, True, False]

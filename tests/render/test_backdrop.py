@@ -51,6 +51,23 @@ def _random_pyramid(seed=1):
     )
 
 
+def test_faint_paths_have_one_tap():
+    ends = straight_ends(_rays(200, radius=0.1), footprint="differential")
+    dimmed = ends._replace(throughput=jnp.full((200, 3), 0.05))
+
+    @jax.jit
+    def taps(ends, faint):
+        domain, pixels = _DOMAINS["spherical"], jnp.arange(200, dtype=jnp.int32)
+        found = backdrop.locate(domain, ends, pixels, resolution=64, most_taps=3, faint=faint)
+        return jnp.prod(found.taps, axis=-1)
+
+    assert np.all(taps(dimmed, jnp.float32(0.1)) == 1)
+    np.testing.assert_array_equal(
+        taps(dimmed, jnp.float32(0.01)), taps(ends, jnp.float32(backdrop.FAINT))
+    )
+    assert np.all(taps(ends, jnp.float32(0.0)) > 1)
+
+
 @pytest.mark.parametrize("count", [pytest.param(40, marks=pytest.mark.slow), 400])
 def test_the_radiance_may_be_linear_in_the_direction(count):
     domain, rays = _DOMAINS["spherical"], _rays(count)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import refref_jax
 from refref_jax.geometry.cameras import image_rays
 from refref_jax.numerics import host_array
 from refref_jax.optics.path_settings import PAPER, STRAIGHT, TREE
@@ -64,3 +65,24 @@ def test_straight_rays_and_none_are_rendered():
     np.testing.assert_array_equal(seen.accumulation, 1.0)
     nothing = jax.tree.map(lambda x: host_array(x[:0]), image_rays(CAMERAS, 1))
     assert render_image(model, nothing).rgb.shape == (0, 16, 3)
+
+
+@pytest.mark.parametrize("settings", [STRAIGHT, TREE])
+def test_scenes_without_objects_show_the_backdrop(settings):
+    model = _model("radiance by direction, in an environment")
+    rays = image_rays(CAMERAS, 1)
+    bare = render_image(model._replace(scene=refref_jax.assemble([]), settings=settings), rays)
+    seen = render_image(model, rays)
+    met = np.isfinite(images.find_first_surface(model.scene.surfaces, rays).distances)
+    np.testing.assert_allclose(bare.linear[~met], seen.linear[~met], atol=1e-6)
+    assert np.all(np.isfinite(bare.linear)) and np.abs(bare.linear - seen.linear)[met].max() > 0.01
+
+
+def test_every_ray_may_meet_an_object():
+    model = _model("radiance by direction, in an environment")
+    whole = image_rays(CAMERAS, 1)
+    met = np.isfinite(images.find_first_surface(model.scene.surfaces, whole).distances)
+    hits = jax.tree.map(lambda x: host_array(x[met]), whole)
+    seen = render_image(model, hits)
+    np.testing.assert_allclose(seen.linear, render_image(model, whole).linear[met], atol=1e-6)
+    np.testing.assert_allclose(seen.accumulation, 1.0, atol=1e-5)
