@@ -378,7 +378,6 @@ def test_dispersed_rays_may_start_inside_parts(rule):
     np.testing.assert_array_equal(given.throughput, _paths(scene, rays).throughput)
 
 
-@pytest.mark.slow
 def test_the_share_of_rays_that_hit_counts_rays_not_colours():
     glass = _BALL._replace(material=Material(dispersion=(1.4, 1.5, 1.6)))
     rays = _rays(0.1, 2.0, 3.0, 4.0)
