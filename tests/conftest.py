@@ -10,6 +10,9 @@ from tests.processes import code_generator
 # Several processes share an accelerator.
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
+# The suite keeps all cores busy, and OpenBLAS's threads would spin while they wait for one.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 # What one process of the suite has compiled, the others and the commands need not compile again.
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="refref_jax_tests_")

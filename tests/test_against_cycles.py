@@ -72,6 +72,7 @@ def test_the_glass_ball_is_as_good_as_its_path_model(ball_scene, settings, at_le
     assert at_least <= np.mean(values) <= at_most
 
 
+@pytest.mark.slow
 def test_the_tree_costs_what_the_slow_one_does(ball_scene):
     counts = [_render(ball_scene, view, TREE)[1:] for view in (0, 10)]
     # `reference_tree`, in float64 on Embree, of rays through the middles of all pixels.
@@ -91,6 +92,7 @@ def test_the_walls_are_exact_to_8_bits(ball_scene, view, at_least):
     assert _psnr(image, target, away) > at_least
 
 
+@pytest.mark.slow
 def test_the_first_surface_is_where_cycles_sees_it(ball_scene):
     frames = scene_folder.read_frames(ball_scene, "test")
     distances = scene_folder.read_distances(frames)[0]

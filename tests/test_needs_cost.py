@@ -77,6 +77,7 @@ def test_no_mesh_compiles_no_tracer():
     assert sum(nothing.values()) < 0.05 * sum(tracer.values())
 
 
+@pytest.mark.slow
 @pytest.mark.loose
 def test_kinds_of_field_that_are_not_trained_cost_nothing(monkeypatch):
     """A step of the usual field is the same program where no other kind exists."""
@@ -123,6 +124,7 @@ def _render_operations(model):
     return _operations(jax.jit(render).lower(params).as_text())
 
 
+@pytest.mark.slow
 def test_bounded_space_is_not_contracted(monkeypatch):
     unbounded = _render_operations(dataclasses.replace(MODEL, space="unbounded"))
 

@@ -389,7 +389,7 @@ class TrainConfig:
             raise ValueError(f"seed is {self.seed}. Give 0 to {_SEEDS - 1}.")
         if self.chosen is not None:
             object.__setattr__(self, "chosen", tuple(map(present_name, self.chosen)))
-        if unknown := sorted(set(self.chosen or ()) - set(_by_name())):
+        if unknown := sorted(set(self.chosen or ()) - set(_OPTIONS)):
             raise ValueError(
                 f"chosen names {unknown[0]!r}, but there is no such option. Remove it there."
             )
@@ -407,7 +407,7 @@ class TrainConfig:
         Raises:
           ValueError: if there is no such option, or a value is out of range.
         """
-        given, options, removed = _converted(given), _by_name(), _nothing(given)
+        given, options, removed = _converted(given), _OPTIONS, _nothing(given)
         usual = {name: options[name].field.default for name in self.followers(**given).decided}
         overrides = (self.overrides() | set(given)) - removed
         chosen = tuple(name for name in options if name in overrides)
@@ -418,7 +418,7 @@ class TrainConfig:
 
         Nothing else changes. The arguments and errors are those of `override`.
         """
-        options, overrides = _by_name(), self.overrides()
+        options, overrides = _OPTIONS, self.overrides()
         chosen = tuple(name for name in options if name in overrides)
         config = dataclasses.replace(self, chosen=chosen)
         for name, value in _converted(values).items():
@@ -437,7 +437,7 @@ class TrainConfig:
         if None not in vars(self.schedule).values():
             return frozenset()
         usual = TrainConfig()
-        return frozenset(name for name in _by_name() if self.get(name) != usual.get(name))
+        return frozenset(name for name in _OPTIONS if self.get(name) != usual.get(name))
 
     def followers(self, **given: Any) -> Followers:
         """Returns the options that depend on values that would change; see `override`."""
@@ -458,7 +458,7 @@ class TrainConfig:
 
     def get(self, name: str) -> Any:
         """Returns a value by the name of its option."""
-        (option,) = (each for each in options_of() if each.name == name)
+        option = _OPTIONS[name]
         section = getattr(self, option.section) if option.section else self
         return getattr(section, option.field.name)
 
@@ -490,10 +490,10 @@ def present_name(name: str) -> str:
     return configuration.present_name(TrainConfig, name)
 
 
-def _by_name() -> dict[str, Option]:
-    return {option.name: option for option in options_of()}
-
-
 def options_of() -> Iterator[Option]:
     """Yields all options of a training run, in the order of the configuration."""
     return configuration.options_of(TrainConfig)
+
+
+# By name; looked up some thousand times for each run.
+_OPTIONS = {option.name: option for option in options_of()}

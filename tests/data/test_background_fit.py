@@ -113,6 +113,7 @@ def test_8_bit_depth_gives_the_size_within_its_error(kind, size, known_masks, ji
     assert jitter or abs(fit.size - size) < 5.0 * fit.error < 0.005 * size
 
 
+@pytest.mark.slow
 def test_the_standard_error_is_that_of_repeated_measurements():
     sizes, errors = [], []
     for seed in range(12):
@@ -151,7 +152,11 @@ def _seen_around(kind, size, centre, *, moved):
 @pytest.mark.parametrize("known_masks", [True, False])
 @pytest.mark.parametrize(
     ("centre", "moved"),
-    [((0.05, 0.0, 0.0), False), ((1.0, -2.0, 0.5), False), ((30.0, -20.0, 10.0), True)],
+    [
+        pytest.param((0.05, 0.0, 0.0), False, marks=pytest.mark.slow),
+        ((1.0, -2.0, 0.5), False),
+        pytest.param((30.0, -20.0, 10.0), True, marks=pytest.mark.slow),
+    ],
 )
 def test_a_background_is_where_the_depths_show_it(kind, eight_bit, known_masks, centre, moved):
     seen, depths, masks = _seen_around(kind, 6.5, centre, moved=moved)

@@ -372,7 +372,13 @@ def test_blocks_that_nearly_touch(distance, found):
     assert len(_warnings(*parts)) == found
 
 
-@pytest.mark.parametrize(("scale", "shift"), [(1e-4, 30.0), (1.0, 0.0), (1e4, 0.0)])
+@pytest.mark.parametrize(
+    ("scale", "shift"),
+    [
+        (1e-4, 30.0),
+        *(pytest.param(scale, 0.0, marks=pytest.mark.slow) for scale in (1.0, 1e4)),
+    ],
+)
 def test_findings_know_no_size(scale, shift):
     def placed(part):
         return part._replace(vertices=scale * (part.vertices + shift))

@@ -239,8 +239,8 @@ def _photographs(views, *, space="spherical", blob=0.0):
     return np.stack(images)
 
 
-def _room_views():
-    rings = [orbit(8, distance=4.0, elevation=e, size=96, angle_x=1.6) for e in (0.9, 0.0, -0.8)]
+def _room_views(size=96):
+    rings = [orbit(8, distance=4.0, elevation=e, size=size, angle_x=1.6) for e in (0.9, 0.0, -0.8)]
     return rings[0]._replace(poses=np.concatenate([ring.poses for ring in rings]))
 
 
@@ -285,6 +285,7 @@ def test_pixels_that_only_see_objects_are_not_judged():
         assert scene_analysis.misfits(tiny, image, (), space="unbounded", size=1.0) == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "space"), [("sphere", "spherical"), ("cube", "bounded")])
 def test_the_size_of_the_background_is_measured_by_its_parallax(kind, space):
     views = _room_views()
@@ -295,8 +296,8 @@ def test_the_size_of_the_background_is_measured_by_its_parallax(kind, space):
 
 
 def test_walls_of_one_colour_have_no_measurable_size():
-    views = _room_views()
-    grey = np.full((24, 96, 96, 3), 99, np.uint8)
+    views = _room_views(size=48)
+    grey = np.full((24, 48, 48, 3), 99, np.uint8)
     assert scene_analysis.fit_size_by_parallax(views, grey, (), "cube") is None
     around = [_made(trimesh.creation.icosphere(2, 5.0))]  # no pixel sees the background directly
     assert scene_analysis.fit_size_by_parallax(views, grey, around, "cube") is None

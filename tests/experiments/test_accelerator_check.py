@@ -6,11 +6,11 @@ import jax
 import numpy as np
 import pytest
 
-from experiments.accelerator import comparisons, report
-from experiments.accelerator.measuring import Context, Row
+from experiments.accelerator import comparisons, measuring, report
+from experiments.accelerator.measuring import Context, Row, Sizes
 from tests.processes.command import ROOT, run_command
 
-pytestmark = [pytest.mark.loose, pytest.mark.longest]
+pytestmark = pytest.mark.loose
 
 _AGREEING = {
     "Single operations": 4,
@@ -35,6 +35,7 @@ def found(checked):
     return {part["name"]: part["rows"] for part in content["parts"]}
 
 
+@pytest.mark.slow
 def test_the_report_has_every_part_and_nothing_failed(checked, found):
     text = (checked[0] / "report.md").read_text("utf-8")
     parts = [part.name for part in report.parts_of(["tiny"])]
@@ -47,6 +48,7 @@ def test_the_report_has_every_part_and_nothing_failed(checked, found):
     assert "0 problems, 0 failed" in text and "0 problems, 0 failed" in checked[1]
 
 
+@pytest.mark.slow
 def test_without_an_accelerator_the_report_says_so(checked):
     said = "no accelerator found: compared the CPU with itself"
     assert said in checked[1]
@@ -54,6 +56,7 @@ def test_without_an_accelerator_the_report_says_so(checked):
     assert "Next: python -m experiments.train" in checked[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", _AGREEING)
 def test_a_cpu_agrees_with_itself(found, part):
     compared = [row for row in found[part] if row["verdict"] == "ok"]
@@ -65,6 +68,7 @@ def test_a_cpu_agrees_with_itself(found, part):
             assert row["value"] <= 1e-5, row
 
 
+@pytest.mark.slow
 def test_something_was_compared(found):
     values = {row["name"]: row["value"] for rows in found.values() for row in rows}
     assert 0.1 < values["rays that hit something"] < 0.9
@@ -72,6 +76,24 @@ def test_something_was_compared(found):
     assert values["a step of 1,024 rays"] > 0.0
     assert values["bytes of a step, counted by the compiler"] > 0.1
     assert values["peak memory since the start"] == "not reported"
+
+
+def test_parts_that_train_nothing_are_reported_and_agree(tmp_path, monkeypatch):
+    few = Sizes(copied=1 << 16, lookups=1 << 12, rays=1 << 12, views=2, cells=64)
+    monkeypatch.setattr(measuring, "_OF_A_CPU", few)
+    monkeypatch.setattr(measuring, "_PATIENCE", 0.0)  # each call is timed once
+    cpu = jax.devices("cpu")[0]
+    context = Context(cpu, cpu, ROOT, 4)
+    parts = report.parts_of(["tiny"])[:3]
+    results = [report.run_part(part, context) for part in parts]
+    assert not report.with_verdict(results, "problem", "failed")
+    report.write(tmp_path, context, results)
+    text = (tmp_path / "report.md").read_text("utf-8")
+    for result in results:
+        assert f"## {result.name}\n" in text and result.rows
+    assert report.summary(results).startswith(f"{1 + _AGREEING['Single operations']} ok")
+    speeds = [row.value for row in results[1].rows]
+    assert len(speeds) == 7 and min(speeds) > 0.0
 
 
 def test_a_gradient_with_one_wrong_array_is_found():

@@ -21,7 +21,7 @@ from refref_jax.render import load_model
 from tests.processes import code_generator
 from tests.processes.command import ROOT, TINY, run_command
 
-pytestmark = pytest.mark.loose
+pytestmark = [pytest.mark.loose, pytest.mark.longest]
 
 # The kinds of distances that an evaluation measures, and how.
 _DISTANCES = ("distance", "surface", "substituted")

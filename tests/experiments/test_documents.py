@@ -8,7 +8,7 @@ import pytest
 
 from tests.processes.command import ROOT
 
-pytestmark = [pytest.mark.loose, pytest.mark.longest]
+pytestmark = pytest.mark.loose
 
 _PAGES = ["README.md", *sorted(f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md"))]
 _DECISIONS = sorted(page.name for page in (ROOT / "docs/decisions").glob("[0-9]*.md"))

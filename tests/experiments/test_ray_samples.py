@@ -25,7 +25,7 @@ _SCENE = ROOT / "experiments" / "data" / "cube_smcvx_ball"
 
 def _model(**changes):
     config = dataclasses.replace(MODEL, **changes)
-    params = init_params(jax.random.PRNGKey(3), config)
+    params = jax.jit(lambda: init_params(jax.random.PRNGKey(3), config))()
     return Model(config, PAPER, scenes.build(scenes.ball(subdivisions=3)), params)
 
 

@@ -297,6 +297,7 @@ def test_a_sweep_writes_everything_and_outlives_a_point_that_fails(tmp_path):
     assert iio.imread(tmp_path / "out" / "trade_off.png").shape[1] > 1000
 
 
+@pytest.mark.slow
 def test_a_sweep_adds_to_the_one_before_it_around_the_same_base(tmp_path):
     def measure(point):
         (tmp_path / "runs" / sweep.run_name(point, _SCENE)).mkdir(parents=True, exist_ok=True)

@@ -6,6 +6,7 @@ import jax
 import numpy as np
 
 from refref_jax.data.batches import PixelSampler
+from refref_jax.fields import registry
 from refref_jax.fields.hash_grid import HashGridConfig
 from refref_jax.fields.zipnerf import DensityFieldConfig, RadianceFieldConfig
 from refref_jax.geometry.cameras import orbit
@@ -60,6 +61,12 @@ CAMERAS = orbit(4, distance=4.0, elevation=0.3, size=16, angle_x=1.1656)
 def initial(config):
     """Returns a model's parameters at the start of training, made once."""
     return jax.jit(lambda: init_params(jax.random.key(0), config))()
+
+
+@functools.cache
+def initial_field(config):
+    """Returns the parameters of a field at the start of training, made once."""
+    return jax.jit(lambda: registry.init_radiance(jax.random.key(0), config))()
 
 
 def sampler(seed=0):

@@ -16,8 +16,6 @@ from refref_jax.sampling.polylines import Gaussians
 from tests.laws import gradients, transformations
 from tests.oracles import reference_sampling
 
-pytestmark = pytest.mark.longest
-
 # Two small matrix products in float32.
 _NETWORK = 1e-5
 
@@ -277,7 +275,13 @@ def _taught(name, precision, params, gaussians):
     return jax.tree.leaves(seen), slopes
 
 
-@pytest.mark.parametrize("name", _CONFIGS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if name in ("density", "radiance") else pytest.mark.slow)
+        for name in _CONFIGS
+    ],
+)
 def test_half_precision_is_near_single_precision(name):
     single, single_slopes = _taught(name, "float32", _parameters(name), _gaussians())
     half, half_slopes = _taught(name, "bfloat16", _parameters(name), _gaussians())

@@ -16,6 +16,7 @@ from refref_jax.fields.base import shape_of
 from refref_jax.fields.hash_grid import HashGridConfig, spherical_harmonics
 from refref_jax.fields.nunerf import Material
 from refref_jax.sampling.polylines import Gaussians
+from tests.factories.small_model import initial_field
 from tests.laws import gradients
 
 _GRID = HashGridConfig(levels=2, base_res=3, max_res=10, hashmap_size=256, features=2)
@@ -38,14 +39,10 @@ _DIFFUSE, _MIRRORED, _REFRACTED = np.array(
 )
 
 
-def _initial(config=_CONFIG):
-    return jax.jit(lambda: registry.init_radiance(jax.random.key(0), config))()
-
-
 def _trained(config=_CONFIG, *, seed=1, size=0.6):
     """Returns parameters as after training: large entries, and biases that are not 0."""
     rng = np.random.default_rng(seed)
-    return jax.tree.map(lambda x: np.float32(rng.normal(0.0, size, x.shape)), _initial(config))
+    return jax.tree.map(lambda x: np.float32(rng.normal(0.0, size, x.shape)), initial_field(config))
 
 
 @functools.partial(jax.jit, static_argnums=1)
@@ -223,7 +220,7 @@ def test_colours_at_the_extremes_are_finite_with_their_gradients():
 
 def test_fields_are_finite_with_their_gradients_where_the_slope_is_zero():
     """Exactly so in the middle of the initial ball, whose signed value is a distance."""
-    initial = _initial()
+    initial = initial_field(_CONFIG)
 
     def seen(params, point):
         found = registry.radiance(params, _CONFIG, _at(point), _TOWARDS)
@@ -247,6 +244,7 @@ def test_gradients_of_the_split_are_numerical():
 # --- what the split is for ---
 
 
+@pytest.mark.slow
 @pytest.mark.loose
 def test_a_view_that_the_surface_does_not_explain_is_memorised():
     """Colours of a place that depend on the direction alone: a few steps halve the error thrice."""
@@ -255,7 +253,7 @@ def test_a_view_that_the_surface_does_not_explain_is_memorised():
     direction = jnp.float32(direction / np.linalg.norm(direction, axis=-1, keepdims=True))
     point = jnp.float32(0.5 + rng.uniform(-0.02, 0.02, size=(256, 3)) + np.array([0.12, 0.0, 0.0]))
     wanted = 0.5 + 0.4 * jnp.sin(3.0 * direction)
-    params = _initial()
+    params = initial_field(_CONFIG)
     optimiser = optax.adam(1e-2)
 
     def loss(params):

@@ -11,6 +11,7 @@ from refref_jax.fields import neus, registry, tnsr
 from refref_jax.fields.hash_grid import HashGridConfig
 from refref_jax.geometry.surfaces import slope
 from refref_jax.sampling.polylines import Gaussians
+from tests.factories.small_model import initial_field
 
 _GRID = HashGridConfig(levels=2, base_res=3, max_res=10, hashmap_size=256, features=2)
 _CENTRE, _RADIUS = (0.3, -0.2, 0.1), 2.0
@@ -31,9 +32,10 @@ def _config(**changes):
 
 def _trained(config):
     """Returns parameters as after training: large entries, and biases that are not 0."""
-    initial = jax.jit(lambda: registry.init_radiance(jax.random.key(0), config))()
     rng = np.random.default_rng(1)
-    return jax.tree.map(lambda x: jnp.float32(0.6 * rng.normal(size=x.shape)), initial)
+    return jax.tree.map(
+        lambda x: jnp.float32(0.6 * rng.normal(size=x.shape)), initial_field(config)
+    )
 
 
 def _surface(params, config):
@@ -42,7 +44,7 @@ def _surface(params, config):
 
 def test_the_initial_surface_is_a_ball():
     config = _config(start=0.4)
-    params = registry.init_radiance(jax.random.key(0), config)
+    params = initial_field(config)
     points = jnp.float32(np.random.default_rng(0).uniform(-1.0, 1.0, (50, 3)))
     found = jax.jit(lambda x: _surface(params, config).values(x))(points)
     expected = np.linalg.norm(np.asarray(points) - _CENTRE, axis=-1) - 0.4 * _RADIUS
@@ -55,6 +57,7 @@ def test_values_and_slopes_are_those_of_neus():
     params, surface = _trained(config), _surface(_trained(config), config)
     opaque, point = tnsr.opaque(config), jnp.array([0.5, 0.3, -0.4], jnp.float32)
 
+    @jax.jit
     def value(x):
         cell = (x - jnp.asarray(_CENTRE)) / _RADIUS * config.ball_radius + 0.5
         seen = neus.radiance(params, opaque, Gaussians(cell[None], jnp.zeros(1)), _TOWARDS)
@@ -64,7 +67,7 @@ def test_values_and_slopes_are_those_of_neus():
     step = 2.0 * _RADIUS / _GRID.max_res
     ends = [[value(point + s * step * axis) for axis in jnp.eye(3)] for s in (1.0, -1.0)]
     expected = (np.array(ends[0]) - np.array(ends[1])) / (2.0 * step)
-    np.testing.assert_allclose(slope(surface, point), expected, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(jax.jit(slope)(surface, point), expected, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -86,10 +89,10 @@ def test_light_comes_from_behind_the_ball_only(place, seen):
 
 def test_an_index_is_learned_within_bounds():
     given, learned = _config(index=1.4), _config(index=1.4, index_from="learned")
-    params = registry.init_radiance(jax.random.key(0), given)
+    params = initial_field(given)
     assert params.index_change is None
     np.testing.assert_allclose(tnsr.index_of(params, given), 1.4, rtol=1e-6)
-    params = registry.init_radiance(jax.random.key(0), learned)
+    params = initial_field(learned)
     move = lambda change: tnsr.index_of(params._replace(index_change=jnp.float32(change)), learned)
     least, most = tnsr.INDICES
     share = (1.4 - least) / (most - least)

@@ -11,8 +11,6 @@ from refref_jax.geometry.rays import Rays
 from tests.factories import arrays
 from tests.oracles import reference
 
-pytestmark = pytest.mark.longest
-
 # Distances are float32 sums of terms near 10.
 _DISTANCE_TOLERANCE = 2e-5
 
@@ -118,9 +116,9 @@ def test_no_ray_slips_through_a_closed_surface(target, subdivisions):
 @pytest.mark.parametrize(
     "count",
     [
-        1,
+        pytest.param(1, marks=pytest.mark.slow),
         pytest.param(15, marks=pytest.mark.slow),
-        16,
+        pytest.param(16, marks=pytest.mark.slow),
         17,
         pytest.param(100, marks=pytest.mark.slow),
     ],
@@ -139,8 +137,8 @@ def test_packets_and_lockstep_give_the_same_hits(count):
 @pytest.mark.parametrize(
     "faces",
     [
-        0,
-        1,
+        pytest.param(0, marks=pytest.mark.slow),
+        pytest.param(1, marks=pytest.mark.slow),
         12,
         pytest.param(300, marks=pytest.mark.slow),
         pytest.param(1500, marks=pytest.mark.slow),

@@ -114,7 +114,10 @@ _trace_ends = jax.jit(
 )
 
 
-@pytest.mark.parametrize("rule", interface_rules.RULES)
+@pytest.mark.parametrize(
+    "rule",
+    ["nested", *(pytest.param(rule, marks=pytest.mark.slow) for rule in ("facing", "priority"))],
+)
 def test_only_the_ratio_of_indices_bends_light(rule):
     parts = [
         scene_assembly.make_part(trimesh.creation.icosphere(radius=radius), index=index, name=name)

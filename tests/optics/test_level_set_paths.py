@@ -21,7 +21,7 @@ from tests.factories import level_sets, scenes
 from tests.laws import gradients
 from tests.oracles import reference
 
-pytestmark = pytest.mark.computing
+pytestmark = [pytest.mark.computing, pytest.mark.longest]
 
 _TWO = PathSettings(max_bends=2, reflections="first")
 _ORIGIN = np.zeros(3)
@@ -76,6 +76,7 @@ def test_a_ball_bends_light_as_the_analytic_ball_does():
     assert bent > 60
 
 
+@pytest.mark.slow
 def test_every_ray_has_its_reflection_and_all_of_its_light():
     rays = _rays(200, spread=1.6)
     traced = _trace(level_sets.scene(level_sets.ball(_ORIGIN, 1.2)), rays)
@@ -97,6 +98,7 @@ def test_every_ray_has_its_reflection_and_all_of_its_light():
     np.testing.assert_allclose(other.directions[met, 1], mirrored, atol=2e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reflections", ["none", "all"])
 def test_light_that_is_not_followed_is_counted_as_dropped(reflections):
     settings = PathSettings(max_bends=4, reflections=reflections, min_throughput=0.02)
@@ -109,6 +111,7 @@ def test_light_that_is_not_followed_is_counted_as_dropped(reflections):
     assert np.mean(traced.dropped) < 0.01
 
 
+@pytest.mark.slow
 def test_trace_and_trace_ends_take_level_sets():
     scene, rays = level_sets.scene(level_sets.ball(_ORIGIN, 1.2)), _rays(200)
     expected = _trace(scene, rays)
@@ -123,6 +126,7 @@ def test_trace_and_trace_ends_take_level_sets():
         meshes_of(scene)
 
 
+@pytest.mark.slow
 def test_paths_are_those_of_a_fine_mesh_with_smooth_normals():
     rays = _rays(200, seed=3)
     mesh = scenes.build(scenes.ball(1.2, subdivisions=5))
@@ -204,6 +208,7 @@ def test_gradients_at_both_surfaces_are_differences_of_the_analytic_ball():
                 np.testing.assert_allclose(ours, expected, rtol=1e-6, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_differentials_are_those_of_neighbouring_rays():
     with jax.enable_x64(True):
         scene = level_sets.scene(level_sets.ball(_ORIGIN, 1.2))

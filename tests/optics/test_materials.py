@@ -21,6 +21,8 @@ from refref_jax.render import shade
 from tests.factories import scenes
 from tests.factories.small_model import CAMERAS
 
+pytestmark = pytest.mark.longest
+
 _OPAQUE = Material("opaque", radiance=(0.8, 0.2, 0.1))
 _GOLD = ((0.18, 0.42, 1.37), (3.42, 2.35, 1.77))
 _BALL = scenes.ball(1.0, subdivisions=3)
@@ -66,7 +68,9 @@ def _main(paths, ray=0):
     return jax.tree.map(lambda x: np.asarray(x)[heaviest], paths)
 
 
-@pytest.mark.parametrize("rule", ["nested", "facing", "priority"])
+@pytest.mark.parametrize(
+    "rule", ["nested", "facing", pytest.param("priority", marks=pytest.mark.slow)]
+)
 def test_light_ends_on_an_opaque_part_inside_glass(rule):
     scene = scenes.build(_BALL, _inner(_OPAQUE), rule=rule)
     path = _main(_paths(scene, _rays(0.02)))
@@ -84,6 +88,7 @@ def test_the_medium_in_front_of_an_opaque_part_absorbs():
     np.testing.assert_allclose(path.throughput, expected, rtol=6e-3)
 
 
+@pytest.mark.slow
 def test_opaque_parts_may_be_half_in_a_liquid():
     reed = _moved(_inner(_OPAQUE, radius=0.3), 0.0, 1.0, 0.0)  # at the wall
     scene = scenes.build(_BALL._replace(index=1.001), reed)
@@ -150,6 +155,7 @@ def test_a_thin_sheet_reflects_twice_from_either_side_and_does_not_bend_light(si
     np.testing.assert_allclose(jnp.sum(paths.throughput[:, 0]), 1.0, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_two_sheets_equal_the_slab_that_they_stand_for():
     # A slab of glass far thinner than a pixel: all its reflections, summed.
     slab, sheet = scenes.box((1e-3, 4.0, 4.0)), _moved(_sheet(), 0.0, 20.0, 0.0)
@@ -270,6 +276,7 @@ def _assert_same_paths(one, other):
         np.testing.assert_allclose(first, second[others], atol=2e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("channel", [0, 1, 2])
 def test_each_channel_of_a_rough_prism_meets_the_facets_of_its_stratum(channel):
     indices = (1.4, 1.5, 1.6)
@@ -289,6 +296,7 @@ def test_interior_lists_leave_the_facets_of_a_stratum_as_they_are():
     _assert_same_paths(_paths(listed, rays), _paths(nested, rays))
 
 
+@pytest.mark.slow
 def test_entry_and_exit_of_a_rough_body_widen_the_footprint_independently():
     heights, rough = np.linspace(-1.0, 1.0, 200), Material(roughness=0.1)
     pixel = np.stack([np.arange(200), np.zeros(200), np.full(200, 64)], axis=-1)
@@ -320,6 +328,7 @@ def test_both_tracers_agree_on_every_kind(material):
         np.testing.assert_allclose(paths.stop.tau[match], path.stop.tau, atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rule", ["nested", "facing"])
 def test_metal_in_a_liquid_keeps_light_in_the_liquid(rule):
     metal = _inner(Material("conductor", complex_index=_GOLD), radius=0.2)
@@ -356,6 +365,7 @@ def test_meshes_of_surfaces_without_inside_may_be_open():
         assert refref_jax.assemble([part]).interfaces.kinds.size == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rule", ["nested", "facing", "priority"])
 def test_dispersed_rays_may_start_inside_parts(rule):
     glass = _BALL._replace(material=Material(dispersion=(1.4, 1.5, 1.6)))
@@ -368,6 +378,7 @@ def test_dispersed_rays_may_start_inside_parts(rule):
     np.testing.assert_array_equal(given.throughput, _paths(scene, rays).throughput)
 
 
+@pytest.mark.slow
 def test_the_share_of_rays_that_hit_counts_rays_not_colours():
     glass = _BALL._replace(material=Material(dispersion=(1.4, 1.5, 1.6)))
     rays = _rays(0.1, 2.0, 3.0, 4.0)
@@ -376,12 +387,14 @@ def test_the_share_of_rays_that_hit_counts_rays_not_colours():
     assert float(surveyed(scenes.build(_BALL), rays).hit_fraction) == 0.25
 
 
+@pytest.mark.slow
 def test_a_mirror_is_followed_where_total_internal_reflections_are_not():
     metal = _sheet(material=Material("conductor", complex_index=_GOLD))
     path = _main(_paths(scenes.build(metal), _rays(0.2), settings=PATH_PRESETS["paper_no_tir"]))
     assert path.num_bends == 1 and path.statuses == PathStatus.ESCAPED
 
 
+@pytest.mark.slow
 def test_light_inside_a_closed_sheet_meets_its_far_wall():
     bubble = _BALL._replace(material=Material("thin_sheet"), colour_known=True)
     tree = find_containment([bubble])

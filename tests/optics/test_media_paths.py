@@ -328,6 +328,7 @@ def _overlapping_cup():
     return [cup, solids.ball("drink_water", radius=0.8, index=1.333)]
 
 
+@pytest.mark.slow
 def test_facing_media_of_an_overlapping_cup():
     paths = _paths(
         scenes.build(*_overlapping_cup(), rule="facing"),
@@ -339,6 +340,7 @@ def test_facing_media_of_an_overlapping_cup():
     assert seen[2] in (glass, water) and seen[4] in (glass, water) and len(seen) == 7
 
 
+@pytest.mark.slow
 def test_facing_media_are_those_around_each_segment():
     parts = _overlapping_cup()
     paths = _paths(scenes.build(*parts, rule="facing"), scenes.rays(*_bundle(_RAYS)))
@@ -355,6 +357,7 @@ def test_facing_media_are_those_around_each_segment():
     assert compared > _RAYS // 4
 
 
+@pytest.mark.slow
 def test_facing_bends_light_by_faces_whatever_the_media():
     parts = _overlapping_cup()
     tracked = scenes.build(*parts, rule="facing")

@@ -147,6 +147,7 @@ def test_media_are_named_along_the_path():
     np.testing.assert_array_equal(paths.media[0, :5], [AMBIENT, 1, 2, 1, AMBIENT])
 
 
+@pytest.mark.slow
 def test_equal_indices_are_invisible():
     scene = scenes.build(scenes.ball(1.0, index=1.0, subdivisions=3))
     rays = scenes.rays([[-4.0, y, 0.0] for y in (0.0, 0.5, 0.9)], [1.0, 0.0, 0.0])
@@ -204,6 +205,7 @@ def test_a_path_out_of_bends_says_so_and_goes_on(bends):
     np.testing.assert_array_equal(cut.directions[0], full.directions[0, : bends + 1])
 
 
+@pytest.mark.slow
 def test_a_budget_that_just_suffices_escapes():
     rays = scenes.rays([-4.0, 0.1, 0.0], [1.0, 0.0, 0.0])
     paths = _refracted(_ball_in_ball("nested"), rays, bends=4)
@@ -256,9 +258,11 @@ def _many_rays():
     ("settings", "capacity"),
     [
         (TREE, 1),
-        *(pytest.param(*case, marks=pytest.mark.slow) for case in ((PAPER, 70), (TREE, 200))),
+        (PAPER, 70),
+        (TREE, 200),
     ],
 )
+@pytest.mark.slow
 def test_weights_and_losses_of_every_ray_sum_to_one_at_any_capacity(settings, capacity):
     traced = _trace(
         scenes.build(scenes.ball(1.0)), _many_rays(), settings=settings, capacity=capacity
@@ -300,6 +304,7 @@ def test_tracing_in_a_pool_equals_tracing_batch_by_batch():
         jax.tree.map(lambda a, b, i=i: np.testing.assert_allclose(a[i], b, atol=1e-6), pool, single)
 
 
+@pytest.mark.slow
 def test_no_mesh_of_a_straight_ray_is_said_to_be_missed():
     traced = _trace(scenes.build(scenes.ball(1.0)), _many_rays(), settings=STRAIGHT)
     assert np.all(traced.paths.statuses == PathStatus.NOT_TRACED)
@@ -344,6 +349,7 @@ def test_total_reflection_at_the_first_surface_needs_no_second_path():
     assert paths.statuses[1] == PathStatus.EMPTY
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [1e-3, 1e3])
 def test_paths_scale_with_the_scene(size):
     part = scenes.ball(1.0, subdivisions=3)

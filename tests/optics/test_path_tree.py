@@ -78,6 +78,7 @@ def test_a_slab_sends_light_both_ways_by_the_geometric_series():
     np.testing.assert_allclose(_sums(ends, traced), 1.0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_throughput_of_black_truncated_paths_is_dropped():
     kept, _ = _ends(_slab(), _down(), settings=_generous(PathSettings(5, "all")))
     ends, traced = _ends(
@@ -141,6 +142,7 @@ def test_an_opaque_tint_leaves_no_path():
     assert np.all(traced.dropped == 0.0)
 
 
+@pytest.mark.slow
 def test_a_total_reflection_may_end_the_path():
     scene = scenes.build(scenes.right_prism())
     rays = scenes.rays([-2.0, 0.1, 0.3], [1.0, 0.0, 0.0])
@@ -207,7 +209,14 @@ def test_untinted_light_is_conserved(settings):
     np.testing.assert_allclose(_sums(ends, traced), 1.0, atol=1e-5)
 
 
-@pytest.mark.parametrize("short_of", ["live_per_ray", "segments_per_ray", "paths_per_ray"])
+@pytest.mark.parametrize(
+    "short_of",
+    [
+        pytest.param("live_per_ray", marks=pytest.mark.slow),
+        pytest.param("segments_per_ray", marks=pytest.mark.slow),
+        "paths_per_ray",
+    ],
+)
 def test_a_list_that_is_too_small_drops_the_least_light_and_returns_it(short_of):
     generous = _generous(PathSettings(6, "all"))
     scarce = dataclasses.replace(generous, **{short_of: 1.5})
@@ -259,7 +268,8 @@ def test_accelerators_cast_all_rays_at_once_into_lists_of_the_same_size(monkeypa
     np.testing.assert_allclose(*found, rtol=1e-5)
 
 
-@pytest.mark.parametrize("segments_per_ray", [pytest.param(2.0, marks=pytest.mark.slow), 90.0])
+@pytest.mark.slow
+@pytest.mark.parametrize("segments_per_ray", [2.0, 90.0])
 def test_last_segments_are_the_same_if_others_are_not_stored(segments_per_ray):
     scene, rays = scenes.build(scenes.box((1.0, 1.2, 1.4))), _towards_a_ball(32)
     settings = dataclasses.replace(_generous(TREE), max_bends=4, segments_per_ray=segments_per_ray)
@@ -279,6 +289,7 @@ def test_last_segments_are_the_same_if_others_are_not_stored(segments_per_ray):
         np.testing.assert_array_equal(one[pick], other[pick])
 
 
+@pytest.mark.slow
 def test_a_stack_holds_as_many_rays_as_there_can_be():
     scene, rays = scenes.build(scenes.box((1.0, 1.2, 1.4))), _towards_a_ball(16)
     settings = dataclasses.replace(_generous(TREE), max_bends=6, min_throughput=0.0)

@@ -218,18 +218,21 @@ def test_bubbles_are_found(world, bubbles):
     assert told == sorted(told) and told[-1] == 1.0
 
 
+@pytest.mark.slow
 def test_nothing_is_found_in_clear_glass(world):
     pixels, judges = _seen(world, [])
     solid = _solid(world, pixels, judges, steps=0)
     assert find_bubbles(solid, world, pixels, judges, settings=_FEW) is solid
 
 
+@pytest.mark.slow
 def test_a_bubble_of_glass_is_none(world):
     pixels, judges = _seen(world, [_ONE], inside=1.5)
     solid = _solid(world, pixels, judges, steps=0)
     assert find_bubbles(solid, world, pixels, judges, settings=_FEW) is solid
 
 
+@pytest.mark.slow
 def test_nothing_is_found_before_a_grey_wall():
     grey = _world(0.0)
     pixels, judges = _seen(grey, [_ONE])
@@ -237,7 +240,6 @@ def test_nothing_is_found_before_a_grey_wall():
     assert find_bubbles(solid, grey, pixels, judges, settings=_FEW) is solid
 
 
-@pytest.mark.longest
 @pytest.mark.slow
 def test_a_dent_of_the_surface_is_no_bubble(world):
     glass = _icosphere(_ORIGIN, 1.0, 5)

@@ -69,7 +69,13 @@ def torus():
     return bodies.as_mesh(trimesh_torus(1.1, 0.5, major_sections=128, minor_sections=64))
 
 
-@pytest.fixture(scope="module", params=["cylinder", "vase", "cup", "ring"])
+@pytest.fixture(
+    scope="module",
+    params=[
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("cylinder", "ring")),
+        *("vase", "cup"),
+    ],
+)
 def fitted(request):
     mesh, profile, closed = _body(request.param)
     shape = fit_revolution(_far(revolved.noisy(mesh, 0.005)))
@@ -181,7 +187,7 @@ def vase():
     return fit_revolution(_body("vase")[0])
 
 
-@pytest.mark.parametrize("name", ["vase", "ring"])
+@pytest.mark.parametrize("name", ["vase", pytest.param("ring", marks=pytest.mark.slow)])
 def test_revolution_as_a_shape(name, vase):
     shape = vase if name == "vase" else fit_revolution(_body(name)[0])
     assert len(shape.start()) == 40
@@ -210,6 +216,7 @@ def test_waves_between_knots_are_smoothed():
     assert np.sqrt(np.mean(away**2)) < 0.0005
 
 
+@pytest.mark.slow
 def test_the_fit_is_equivariant():
     mesh = revolved.noisy(_body("vase")[0], 0.005)
     near, far = fit_revolution(mesh), fit_revolution(revolved.placed(mesh, offset=_FAR, scale=0.01))
@@ -288,6 +295,7 @@ def test_corners_where_five_planes_meet():
     posed_surfaces.assert_prior(shape)
 
 
+@pytest.mark.slow
 def test_what_is_far_from_a_family_is_none(ball):
     blob, box = _far(revolved.blob(ball)), bodies.fine_box(spacing=0.1)
     assert fit_sphere(box) is None and fit_torus(box) is None and fit_revolution(box) is None
@@ -304,6 +312,7 @@ def test_a_dented_box_is_no_convex_polyhedron():
     assert fit_polyhedron(dented) is None
 
 
+@pytest.mark.slow
 def test_candidates_are_ordered_and_near(ball, torus):
     shapes = candidates(ball)
     assert [shape.name for shape in shapes] == ["sphere", "surface of revolution", "free surface"]

@@ -211,6 +211,7 @@ def photographs(body, surface, small_tiles):
     return vessels.photographs(Vessel(body, _FLASK, _SMALL), surface)
 
 
+@pytest.mark.slow
 def test_a_look_finds_the_tint_and_prefers_the_truth(body, surface, photographs):
     clear = dataclasses.replace(_FLASK, tint=(1.0, 1.0, 1.0))
     others = (dataclasses.replace(clear, level=0.3), Interior("liquid", wall=0.12))
@@ -252,6 +253,7 @@ def test_an_absorbing_liquid_is_told_from_a_tinted_surface(body, surface):
     assert [each.absorption for each in solids] == [(0.0,) * 3, found.absorption, (0.0,) * 3]
 
 
+@pytest.mark.slow
 def test_the_simplest_of_equally_good_findings_is_kept(body, surface, photographs):
     def finding(interior):
         vessel = Vessel(body, interior, _SMALL)
@@ -300,6 +302,7 @@ def test_bases_lids_and_punts_are_looked_at(body, surface, small_tiles):
     assert found.punt == pytest.approx(truth.punt, abs=0.045)
 
 
+@pytest.mark.slow
 def test_looks_leave_out_walls_that_fill_the_vessel(body, surface, photographs):
     settings = SearchSettings((0.05, 0.4), 1, (0.04,), (1.36,), mouths=(False,))
     found = interior_looks.looks_at_all(body, surface, photographs, settings)
@@ -307,6 +310,7 @@ def test_looks_leave_out_walls_that_fill_the_vessel(body, surface, photographs):
     assert all(each.interior.wall == pytest.approx(0.13, abs=0.01) for each in found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tint", [(1.0, 1.0, 1.0), (0.9, 0.97, 0.8)])
 def test_stained_glass_is_looked_at_where_it_pays(body, surface, small_tiles, tint):
     del small_tiles
@@ -320,6 +324,7 @@ def test_stained_glass_is_looked_at_where_it_pays(body, surface, small_tiles, ti
     assert any(each.interior.stained for each in looks) == best.stained
 
 
+@pytest.mark.slow
 def test_looks_tell_coloured_solid_glass_from_a_vessel(body, surface, small_tiles):
     del small_tiles
     solid = Interior("none", stained=True, glass_tint=(0.7, 0.9, 0.8))

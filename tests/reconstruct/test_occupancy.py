@@ -1,3 +1,4 @@
+import dataclasses
 import functools
 
 import jax
@@ -15,15 +16,19 @@ from refref_jax.reconstruct.occupancy_field import OccupancyFieldConfig
 from tests.factories import bodies
 from tests.laws import gradients
 
-pytestmark = pytest.mark.longest
-
 _FIELD = OccupancyFieldConfig(
     grid=HashGridConfig(levels=2, base_res=4, max_res=16, hashmap_size=1 << 13, features=2),
     width=16,
 )
 _SMALL = OccupancyTrainingConfig(field=_FIELD, steps=200, batch=512, scan=16, surface=64)
+_BRIEF = dataclasses.replace(_SMALL, steps=10)
 _BOX = Box(np.array([-1.2, -1.5, -1.1]), np.array([1.3, 1.4, 1.2]))
 _BALL = 4.0 / 3.0 * np.pi
+
+
+@functools.cache
+def _initial():
+    return jax.jit(lambda: occupancy_field.init(jax.random.key(0), _FIELD))()
 
 
 @functools.cache
@@ -32,10 +37,10 @@ def _ball_views():
     return bodies.masks_of(bodies.ball, cameras), cameras
 
 
-def _fit(masks, cameras, *, box=_BOX, **options):
-    # Optax mixes integers and floats. All fits compile once.
+def _fit(masks, cameras, *, config=_SMALL, box=_BOX, **options):
+    # Optax mixes integers and floats. All fits of a configuration compile once.
     with jax.numpy_dtype_promotion("standard"):
-        return occupancy.fit(masks, cameras, config=_SMALL, resolution=32, box=box, **options)
+        return occupancy.fit(masks, cameras, config=config, resolution=32, box=box, **options)
 
 
 @functools.cache
@@ -46,7 +51,7 @@ def _fitted():
 
 
 def test_an_untrained_field_is_a_ball():
-    params = occupancy_field.init(jax.random.key(0), _FIELD)
+    params = _initial()
     points = jax.random.uniform(jax.random.key(1), (50, 3))
     found = jax.vmap(functools.partial(occupancy_field.signed, params, _FIELD))(points)
     expected = np.linalg.norm(np.asarray(points) - 0.5, axis=1) - 0.4
@@ -54,7 +59,7 @@ def test_an_untrained_field_is_a_ball():
 
 
 def test_the_slope_of_a_ball_points_outwards():
-    params = occupancy_field.init(jax.random.key(0), _FIELD)
+    params = _initial()
     at = jnp.asarray([0.8, 0.5, 0.9])
     for step in (0.02, 0.002):
         slope = occupancy_field.slope(params, _FIELD, at, step=step)
@@ -64,7 +69,7 @@ def test_the_slope_of_a_ball_points_outwards():
 
 @pytest.mark.parametrize("at", [(0.5, 0.5, 0.5), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)])
 def test_gradients_of_the_field_are_finite_in_the_middle_and_at_corners(at):
-    params = occupancy_field.init(jax.random.key(0), _FIELD)
+    params = _initial()
     by_all = jax.grad(lambda params, at: occupancy_field.signed(params, _FIELD, at), argnums=(0, 1))
     assert gradients.all_finite(by_all(params, jnp.asarray(at)))
 
@@ -133,7 +138,7 @@ def test_one_view_and_one_without_an_outline_are_taken():
 
 
 def test_the_grid_covers_the_box():
-    grid, _ = _fitted()
+    grid = _fit(*_ball_views(), config=_BRIEF)
     high = grid.low + grid.spacing * (np.array(grid.values.shape) - 1)
     assert np.all(grid.low < _BOX.low) and np.all(high > _BOX.high)
     assert max(grid.values.shape) == 33
@@ -164,5 +169,5 @@ def test_errors_say_what_to_do():
 def test_an_empty_field_is_not_handed_on(monkeypatch):
     outside = lambda params, positions, *, config: jnp.ones(len(positions))
     monkeypatch.setattr(occupancy, "field_values", outside)
-    with pytest.raises(ReconstructionError, match="The field is empty after 200 steps on 24 masks"):
-        _fit(*_ball_views())
+    with pytest.raises(ReconstructionError, match="The field is empty after 10 steps on 24 masks"):
+        _fit(*_ball_views(), config=_BRIEF)

@@ -121,6 +121,7 @@ def test_a_chord_of_no_length_is_seen_as_one_point():
     np.testing.assert_allclose(np.exp(logit), odds, rtol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("softness", [0.03, 0.003])
 def test_the_outline_of_a_ball_lies_outside_of_it_by_softness_times_log_of_samples(softness):
     offsets = jnp.linspace(0.15, 0.35, 401)

@@ -63,6 +63,7 @@ def test_a_cap_is_found_where_it_is(body, surface, clear):
     assert found.colour == pytest.approx(_BLUE, abs=0.01)
 
 
+@pytest.mark.slow
 def test_a_cap_and_a_foot_are_two_ends(body, surface, clear):
     ends = (_foot(body, 0.3, (0.5, 0.2, 0.1)), _cap(body, 0.4))
     found = find_opaque_ends(body, surface, _painted(body, clear, *ends))
@@ -71,10 +72,12 @@ def test_a_cap_and_a_foot_are_two_ends(body, surface, clear):
         assert end.colour == pytest.approx(true.colour, abs=0.02)
 
 
+@pytest.mark.slow
 def test_clear_glass_has_no_opaque_ends(body, surface, clear):
     assert find_opaque_ends(body, surface, _painted(body, clear)) == ()
 
 
+@pytest.mark.slow
 def test_in_front_of_a_plain_wall_nothing_is_told(body, surface, clear):
     grey = Backdrop(
         surface.domain, tuple(0.0 * mip + 0.4 for mip in surface.mips), surface.coverage
@@ -83,6 +86,7 @@ def test_in_front_of_a_plain_wall_nothing_is_told(body, surface, clear):
     assert find_opaque_ends(body, grey, same) == ()
 
 
+@pytest.mark.slow
 def test_what_is_opaque_as_a_whole_has_no_ends(body, surface, clear):
     whole = OpaqueEnd(-4.0, 4.0, _BLUE)
     assert find_opaque_ends(body, surface, _painted(body, clear, whole)) == ()
@@ -90,6 +94,7 @@ def test_what_is_opaque_as_a_whole_has_no_ends(body, surface, clear):
     assert find_opaque_ends(ring, surface, clear) == ()
 
 
+@pytest.mark.slow
 def test_two_ends_that_leave_little_are_none(body, surface, clear):
     ends = (_foot(body, 1.2), _cap(body, 1.2))
     assert find_opaque_ends(body, surface, _painted(body, clear, *ends)) == ()
@@ -101,6 +106,7 @@ def test_a_high_cap_is_no_foot(body):
     assert clear_part(body, (foot, cap)).points[:, 1].max() == pytest.approx(cap.low, abs=0.02)
 
 
+@pytest.mark.slow
 def test_few_pixels_tell_nothing(body, surface, clear):
     some = _painted(body, clear, _cap(body, 0.55)).chosen(np.arange(40))
     assert find_opaque_ends(body, surface, some) == ()
@@ -121,6 +127,7 @@ def test_glass_and_ends_are_apart_and_fill_the_body(body):
     assert total == pytest.approx(volume(whole.vertices, whole.faces), rel=0.02)
 
 
+@pytest.mark.slow
 def test_pixels_of_ends_are_left_out(body, clear):
     end = _cap(body, 0.55)
     seen = opaque_ends.seen_by(body, (end,), clear)

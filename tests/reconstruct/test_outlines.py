@@ -127,6 +127,7 @@ def _waisted(points):
     return 0.6 * (np.hypot(radius, points[..., 2]) - 0.9 - 0.05 * np.cos(3.0 * points[..., 2]))
 
 
+@pytest.mark.slow
 def test_outlines_alone_determine_the_profile_of_a_body_of_revolution():
     cameras = bodies.cameras_around(24, size=120, distance=3.0)
     views = Views(bodies.masks_of(_waisted, cameras, steps=120), cameras)
@@ -150,6 +151,7 @@ def _radial_errors(points):
     return np.linalg.norm(points, axis=-1) - 0.9 - 0.05 * np.cos(3.0 * points[:, 1])
 
 
+@pytest.mark.slow
 def test_a_ring_is_fitted_to_its_outlines():
     cameras = bodies.cameras_around(24, size=120, distance=3.0)
     views = Views(

@@ -14,7 +14,7 @@ from refref_jax.reconstruct.smoothing import denoise_within
 from tests.factories import bodies
 from tests.factories.scenes import volume_of
 
-pytestmark = [pytest.mark.longest, pytest.mark.computing]
+pytestmark = pytest.mark.computing
 
 _BOX = Box(np.full(3, -1.6), np.full(3, 1.6))
 
@@ -134,6 +134,7 @@ def test_a_cavity_is_no_floater():
     assert volume_of(kept) == pytest.approx(volume_of(shell))
 
 
+@pytest.mark.slow
 def test_rounding_a_cube_leaves_the_volume_of_a_rounded_cube():
     mesh = bodies.as_mesh(trimesh.creation.box((1.6, 1.6, 1.6)))
     radius, inner = 0.2, 1.2
@@ -144,6 +145,7 @@ def test_rounding_a_cube_leaves_the_volume_of_a_rounded_cube():
     assert np.ptp(found.vertices, axis=0) == pytest.approx(1.6, abs=0.01)
 
 
+@pytest.mark.slow
 def test_meshing_anew_keeps_a_ball_and_its_normals():
     found = refinement.remesh(bodies.icosphere(4), 0.1)
     away = np.linalg.norm(found.vertices, axis=-1)
@@ -161,9 +163,12 @@ _EVERY_STAGE = Refinement(
     "mesh",
     [
         pytest.param(bodies.icosphere(3), marks=pytest.mark.slow),
-        bodies.joined(bodies.icosphere(3), bodies.icosphere(1, radius=0.1, centre=(1.3, 0, 0))),
+        pytest.param(
+            bodies.joined(bodies.icosphere(3), bodies.icosphere(1, radius=0.1, centre=(1.3, 0, 0))),
+            marks=pytest.mark.slow,
+        ),
         bodies.as_mesh(trimesh.creation.box((1.6, 1.6, 0.05)).subdivide_to_size(0.15)),
-        _shaken(_surface(bodies.torus, 0.1), 0.004),
+        pytest.param(_shaken(_surface(bodies.torus, 0.1), 0.004), marks=pytest.mark.slow),
     ],
     ids=["ball", "floater", "thin wall", "torus"],
 )

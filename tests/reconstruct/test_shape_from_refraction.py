@@ -305,6 +305,7 @@ def test_lengths_of_main_paths_are_chords_and_finite_in_the_dark(world, ball, ab
         np.testing.assert_allclose(found.lengths[:, 0], chords, rtol=3e-3)
 
 
+@pytest.mark.slow
 def test_handles_of_a_free_surface_have_the_slopes_of_predictions(world, ball):
     model = SingleObject(FreeSurface(_ball_mesh(ball), 0.25), _INDEX)
     rays, _ = _rays(4, reach=0.85)
@@ -327,7 +328,8 @@ def test_handles_of_a_free_surface_have_the_slopes_of_predictions(world, ball):
     assert np.sum(slopes * expected) / np.sum(slopes**2) == pytest.approx(1.0, abs=0.05)
 
 
-@pytest.mark.parametrize("true", [1.5, pytest.param(1.62, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("true", [1.5, 1.62])
 def test_the_index_is_found_from_a_wrong_start(world, ball, true):
     search = IndexSearch(1.3, 1.8, spacing=0.1, descents=1)
     told = []
@@ -371,6 +373,7 @@ def test_a_ball_that_is_a_little_off_returns(world, seen):
     assert np.all(np.sqrt(np.diag(found.covariance)) < 2e-3)
 
 
+@pytest.mark.slow
 def test_fewer_pixels_know_less(world, glass, seen):
     some = np.random.default_rng(1).permutation(len(seen.views))[:400]
     few, many = (
@@ -420,6 +423,7 @@ def test_a_free_surface_loses_a_dent_that_no_outline_shows(world, ball, seen, ju
     assert np.all(np.isfinite(deviations)) and 0.0 < np.median(deviations) < 1.0
 
 
+@pytest.mark.slow
 def test_a_wide_scale_weighs_a_fault_that_few_pixels_see(world, glass, seen):
     few = np.zeros(len(seen.views), bool)
     few[::20] = True
@@ -437,6 +441,7 @@ def test_a_wide_scale_weighs_a_fault_that_few_pixels_see(world, glass, seen):
     assert 0.0 < 3.0 * steps[0] < steps[1] < 0.02
 
 
+@pytest.mark.slow
 def test_a_fit_ends_after_two_steps_that_gain_little(world, glass, seen):
     settings = Steps(blurs=(1, 0, 0, 0, 0), rays=2048, judges=1024, gain=0.9, least=0.0)
     assert len(gauss_newton.fit(glass, glass.start(), world, seen, settings=settings).steps) == 3
@@ -485,6 +490,7 @@ def test_before_a_grey_wall_the_body_stays_as_it_is(ball, seen, judges, monkeypa
         assert trial.index_deviation == pytest.approx(0.02, rel=0.05)
 
 
+@pytest.mark.slow
 def test_an_index_that_the_user_gave_stays(world, seen):
     model = SingleObject(Sphere(_ORIGIN, 1.005), 1.48, deviation=0.0)
     found = gauss_newton.fit(model, model.start(), world, seen, settings=Steps(blurs=(0, 0)))
@@ -492,6 +498,7 @@ def test_an_index_that_the_user_gave_stays(world, seen):
     assert found.covariance[-1, -1] < 1e-12 and found.taken > 0
 
 
+@pytest.mark.slow
 def test_tints_are_found_with_the_index(world, seen, ball):
     tint = np.array([0.9, 0.97, 0.8])
     true = SingleObject(ball, _INDEX, tinted=True)
@@ -532,6 +539,7 @@ def _equations(candidate, surface, pixels):
     return gauss_newton.linearise(candidate, body, surface, pixels, Steps())
 
 
+@pytest.mark.slow
 def test_saturated_and_unseen_pixels_lose_their_weight(world, glass, seen):
     candidate = glass.pose(glass.start())
     plain = _equations(candidate, world, seen)

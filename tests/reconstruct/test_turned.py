@@ -124,7 +124,10 @@ def test_vertices_lie_on_the_cylinder():
     assert np.allclose(np.where(inside > 0.0, np.linalg.norm(away, axis=-1), inside), 0.06)
 
 
-@pytest.mark.parametrize("name", list(_BODIES))
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=() if name == "bottle" else pytest.mark.slow) for name in _BODIES],
+)
 def test_a_body_is_found_under_noise(name):
     corners, fillets, closed = _parts(name)
     shape = fit_turned(_far(_mesh(name)))
@@ -160,6 +163,7 @@ def test_what_is_not_turned_is_none():
     assert fit_turned(bodies.fine_box(spacing=0.1)) is None
 
 
+@pytest.mark.slow
 def test_the_fit_is_equivariant():
     mesh = revolved.noisy(_mesh("cone"), 0.005)
     near, far = fit_turned(mesh), fit_turned(revolved.placed(mesh, offset=_FAR, scale=0.01))
@@ -167,6 +171,7 @@ def test_the_fit_is_equivariant():
     assert np.allclose((moved - _FAR) / 0.01, near.pose(near.start()).vertices, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_candidates_prefer_straight_pieces():
     mesh = _mesh("cylinder")
     shapes = candidates(mesh)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +27,8 @@ from tests.factories import arrays, made_paths, scenes
 from tests.factories.small_model import MODEL
 from tests.laws import gradients
 
+pytestmark = pytest.mark.longest
+
 _ONE = jnp.float32(1.0)
 _SPACES = ("bounded", "spherical", "unbounded")
 
@@ -44,6 +47,16 @@ _KINDS = {
         RaydefPolylineProposalConfig,
     ),
 }
+
+# Every run of the suite does both kinds, and two spaces.
+_OFTEN = [("raydef", "bounded"), ("raydef_polyline", "unbounded")]
+_each_kind_and_space = pytest.mark.parametrize(
+    ("kind", "space"),
+    [
+        pytest.param(*pair, marks=() if pair in _OFTEN else pytest.mark.slow)
+        for pair in itertools.product(_KINDS, _SPACES)
+    ],
+)
 
 
 def _config(kind, space="bounded", **changes):
@@ -89,8 +102,7 @@ def _straight(config, params, path=None):
     return _seen(plain, params._replace(field=params.field.field), path)
 
 
-@pytest.mark.parametrize("space", _SPACES)
-@pytest.mark.parametrize("kind", _KINDS)
+@_each_kind_and_space
 def test_without_offsets_a_ray_is_straight(kind, space):
     config = _config(kind, space)
     params = _with_offset(_trained(config))
@@ -217,6 +229,7 @@ def test_knots_stay_within_the_bounds(monkeypatch):
     )
 
 
+@pytest.mark.slow
 def test_a_far_sky_can_move_behind_a_polyline():
     """Offsets grow with distance: otherwise the last segment would hardly turn."""
     config = _config("raydef_polyline", "unbounded", far=1000.0)
@@ -242,8 +255,7 @@ def _slopes_of_colours(params, config, path):
     return jnp.sum(_seen(config, params, path).composite.rgb)
 
 
-@pytest.mark.parametrize("space", _SPACES)
-@pytest.mark.parametrize("kind", _KINDS)
+@_each_kind_and_space
 def test_colours_train_the_deformation(kind, space):
     config = _config(kind, space)
     slopes = _slopes_of_colours(_trained(config), config, _path())
@@ -254,6 +266,7 @@ def test_colours_train_the_deformation(kind, space):
     assert gradients.all_finite(slopes)
 
 
+@pytest.mark.slow
 def test_proposals_do_not_train_the_deformation():
     config = _config("raydef")
 
@@ -270,6 +283,7 @@ def test_proposals_do_not_train_the_deformation():
     assert any(np.any(leaf) for leaf in jax.tree.leaves(last.field.deformation))
 
 
+@pytest.mark.slow
 def test_the_end_of_the_training_is_the_default_progress():
     config = _config("raydef")
     params, still = _trained(config), Jitter(jnp.zeros(2), jnp.zeros(2))

@@ -87,6 +87,7 @@ def test_nothing_is_compiled_twice(model):
     assert (images._trace_tile._cache_size(), images._render_chunk._cache_size()) == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rays_per_pixel", [1, 4])
 def test_no_image_compiles_after_the_warm_up_off_cpus(model, monkeypatch, rays_per_pixel):
     monkeypatch.setattr(images, "runs_on_cpu", lambda: False)
@@ -128,6 +129,7 @@ def test_rays_that_only_fill_up_a_tile_are_not_rendered(model, rays):
     assert int(tile.count) == 200
 
 
+@pytest.mark.slow
 def test_rays_that_miss_pay_nothing_for_reflection(model, rays):
     flat = _first(rays, 256)
     paper = images._trace_tile(

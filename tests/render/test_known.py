@@ -28,6 +28,8 @@ from refref_jax.render.backgrounds import (
 )
 from tests.factories import scenes
 
+pytestmark = pytest.mark.longest
+
 _BALL = scenes.ball(1.3, subdivisions=2)
 
 
@@ -105,6 +107,7 @@ def test_a_function_of_the_user_s_sees_origins_and_directions(scene, rays):
     np.testing.assert_allclose(seen.linear, rays.origins / 10.0 + rays.directions + 2.0, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_each_ray_behind_a_rough_surface_sees_its_share_of_the_background():
     window = scenes.build(
         scenes.box((9.0, 9.0, 0.5))._replace(material=refref_jax.Material(roughness=0.5))
@@ -154,6 +157,7 @@ def test_a_tile_without_rays_is_refused(scene, rays):
         render_known(scene, _WHITE, rays, settings=TREE, tile=0)
 
 
+@pytest.mark.slow
 def test_a_camera_inside_a_body_is_told_by_the_rule_of_priorities():
     scene = scenes.build(_BALL, rule="priority")
     rays = scenes.rays([[0.0, 0.0, 0.0]] * 3, np.eye(3))
@@ -167,6 +171,7 @@ def test_a_camera_inside_a_body_is_told_by_the_rule_of_priorities():
     assert seen.casts == 6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["cube", "sphere"])
 def test_a_scene_that_is_moved_as_a_whole_gives_the_same_image(rays, kind):
     texels = np.random.default_rng(1).uniform(size=(6, 4, 4, 3)).astype(np.float32)
@@ -253,6 +258,7 @@ def _stripes(origin, direction):
     return jnp.where(jnp.sin(4.0 * direction[2]) > 0.0, 0.9, 0.1) + 0.0 * origin
 
 
+@pytest.mark.slow
 def test_pixels_whose_rays_differ_from_neighbours_get_more_rays(scene):
     seen = _image(scene, _stripes, refined_rays_per_pixel=25, tolerance=0.2)
     first = render_known(scene, _stripes, _rays(2), settings=TREE, tile=_TILE).rgb
@@ -266,6 +272,7 @@ def test_pixels_whose_rays_differ_from_neighbours_get_more_rays(scene):
     np.testing.assert_allclose(seen.linear, expected, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_refined_pixels_are_nearer_to_the_truth_than_more_rays_everywhere(scene):
     truth, _ = _uniform(scene, _stripes, 24)
     seen = _image(scene, _stripes, refined_rays_per_pixel=36, tolerance=0.2)

@@ -107,7 +107,7 @@ def _painted(config, fog):
     return jax.jit(lambda *arguments: slopes(*arguments)[::-1])
 
 
-@pytest.mark.parametrize("multisamples", [1, 6])
+@pytest.mark.parametrize("multisamples", [pytest.param(1, marks=pytest.mark.slow), 6])
 @pytest.mark.parametrize("offset", [-0.4, 0.0, 0.3])
 @pytest.mark.parametrize(("space", "order"), [("bounded", np.inf), ("spherical", 2)])
 def test_a_painted_wall_is_seen_exactly(monkeypatch, space, order, offset, multisamples):
@@ -225,7 +225,7 @@ def _brightness(config):
     return jax.jit(jax.value_and_grad(brightness, argnums=(0, 1)))
 
 
-@pytest.mark.parametrize("multisamples", [1, 6])
+@pytest.mark.parametrize("multisamples", [pytest.param(1, marks=pytest.mark.slow), 6])
 @pytest.mark.parametrize("distance", [0.0, 7.5, 300.0])
 def test_values_and_gradients_are_finite_wherever_the_camera_is(distance, multisamples):
     config = dataclasses.replace(_END, multisamples=multisamples)

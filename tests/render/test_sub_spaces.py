@@ -163,7 +163,7 @@ def as_sub_space(monkeypatch):
     return plant
 
 
-@pytest.mark.parametrize("last_sample", ["middle", "end"])
+@pytest.mark.parametrize("last_sample", [pytest.param("middle", marks=pytest.mark.slow), "end"])
 def test_one_sub_space_equals_the_plain_field(as_sub_space, last_sample):
     config = dataclasses.replace(MODEL, last_sample=last_sample)
     params = _trained(config)
@@ -266,7 +266,11 @@ def test_light_of_a_backdrop_passes_through_each_sub_space_by_itself(planted):
 # --- the rest of the renderer ---
 
 
-@pytest.mark.parametrize("settings", [STRAIGHT, TREE], ids=["straight", "tree"])
+@pytest.mark.parametrize(
+    "settings",
+    [pytest.param(STRAIGHT, marks=pytest.mark.slow), TREE],
+    ids=["straight", "tree"],
+)
 def test_it_renders_along_straight_and_bent_paths(settings):
     scene = scenes.build(scenes.ball(1.3, subdivisions=1))
     rays = scenes.rays([[-4.0, 0.21, 0.33], [-4.0, 3.0, 0.0]], [1.0, 0.02, 0.01])
@@ -279,6 +283,7 @@ def test_it_renders_along_straight_and_bent_paths(settings):
     assert np.all(np.asarray(seen.linear) <= 1.0011) and np.std(seen.linear) > 0.0
 
 
+@pytest.mark.slow
 def test_an_opaque_surface_has_the_colour_of_the_blended_features():
     """One interval of weight 1, as the last of a path that ends there."""
     params = _trained()

@@ -43,7 +43,9 @@ _CONFIG = dataclasses.replace(
     MODEL, field=NeusConfig(**_SHAPE), proposals=_PROPOSALS, samples=96, last_sample="end"
 )
 _UNISURF = dataclasses.replace(_CONFIG, field=UnisurfConfig(**_SHAPE))
-_KINDS = pytest.mark.parametrize("config", [_CONFIG, _UNISURF], ids=["neus", "unisurf"])
+_KINDS = pytest.mark.parametrize(
+    "config", [_CONFIG, pytest.param(_UNISURF, marks=pytest.mark.slow)], ids=["neus", "unisurf"]
+)
 _ONE = jnp.float32(1.0)
 _radiance = jax.jit(volume_rendering.path_radiance, static_argnums=1)
 
@@ -116,6 +118,7 @@ def test_weights_are_those_of_the_kinds_law():
     np.testing.assert_allclose(found.surface.curvature, bends[within].sum(), rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_end_of_the_training_is_the_default_progress():
     config = dataclasses.replace(
         _CONFIG, field=dataclasses.replace(_CONFIG.field, head_on=(0.0, 0.4))
@@ -130,9 +133,9 @@ def test_the_end_of_the_training_is_the_default_progress():
 @pytest.mark.parametrize(
     ("config", "settings"),
     [
-        pytest.param(_CONFIG, STRAIGHT, id="neus-straight"),
+        pytest.param(_CONFIG, STRAIGHT, marks=pytest.mark.slow, id="neus-straight"),
         pytest.param(_CONFIG, TREE, id="neus-tree"),
-        pytest.param(_UNISURF, STRAIGHT, id="unisurf-straight"),
+        pytest.param(_UNISURF, STRAIGHT, marks=pytest.mark.slow, id="unisurf-straight"),
         pytest.param(_UNISURF, TREE, marks=pytest.mark.slow, id="unisurf-tree"),
     ],
 )

@@ -440,7 +440,16 @@ def test_rotation_moves_no_interval():
 # --- scenes around another centre ---
 
 
-@pytest.mark.parametrize("space", ["bounded", "spherical", "unbounded"])
+_each_space = pytest.mark.parametrize(
+    "space",
+    [
+        *(pytest.param(space, marks=pytest.mark.slow) for space in ("bounded", "spherical")),
+        "unbounded",
+    ],
+)
+
+
+@_each_space
 def test_a_model_that_is_moved_with_its_paths_gives_the_same(space):
     centre = np.array([4.0, -2.0, 8.0], np.float32)
     usual = dataclasses.replace(_FIELD, space=space)
@@ -457,7 +466,7 @@ def test_a_model_that_is_moved_with_its_paths_gives_the_same(space):
     )
 
 
-@pytest.mark.parametrize("space", ["bounded", "spherical", "unbounded"])
+@_each_space
 def test_samples_gradients_and_lookups_of_a_moved_model_are_the_same(space):
     centre = np.array([4.0, -2.0, 8.0], np.float32)
     usual = dataclasses.replace(_FIELD, space=space)

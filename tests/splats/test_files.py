@@ -89,6 +89,7 @@ def test_nan_is_refused(tmp_path):
         splats.read_ply(path)
 
 
+@pytest.mark.slow
 def test_distances_are_along_the_rays():
     """A wall of opaque, flat Gaussians at z = 0, seen from above."""
     cameras = orbit(2, distance=4.0, elevation=1.4, size=20, angle_x=1.1656)

@@ -138,7 +138,7 @@ def test_projection_is_that_of_matrices():
         assert found.depths[i] == pytest.approx(depth, rel=1e-5)
 
 
-@pytest.mark.parametrize("kernel", ["classic", "mip"])
+@pytest.mark.parametrize("kernel", [pytest.param("classic", marks=pytest.mark.slow), "mip"])
 def test_derivatives_are_those_of_differences(kernel):
     def smooth(*leaves):
         found = splats.project_all(Gaussians(*leaves), view, **_SIZE, kernel=kernel)

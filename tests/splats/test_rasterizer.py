@@ -15,6 +15,8 @@ from tests.factories import made_splats
 from tests.laws import gradients
 from tests.oracles import reference_splats
 
+pytestmark = pytest.mark.longest
+
 _SIZE = made_splats.WIDTH, made_splats.HEIGHT
 _GRID, _SMALL = Grid(*_SIZE, 8), Grid(16, 16, 8)
 _CAPACITY = 20_000
@@ -33,6 +35,13 @@ def form(request, monkeypatch):
     monkeypatch.setattr(rasterizer, "_backward", getattr(rasterizer, backward))
     monkeypatch.setattr(images, "_listed", getattr(images, lists))
     return request.param
+
+
+def _often(name):
+    """Every run of the suite tests one form, and slow ones the other."""
+    marks = {each: () if each == name else pytest.mark.slow for each in _FORMS}
+    forms = [pytest.param(each, marks=mark) for each, mark in marks.items()]
+    return pytest.mark.parametrize("form", forms, indirect=True)
 
 
 def _projected(values, view, grid=_GRID):
@@ -138,6 +147,7 @@ def test_the_derivatives_of_gaussians_are_those_of_float64(form, scene):
         np.testing.assert_allclose(mine, theirs, atol=1e-4 * np.abs(theirs).max())
 
 
+@_often("native")
 def test_one_gaussian_by_hand(form):
     scale, depth, focal = 0.1, 2.0, 20.0
     seen = _image(made_splats.one((0, 0, depth), opacity=0.8))
@@ -153,6 +163,7 @@ def test_one_gaussian_by_hand(form):
     assert not np.any(seen.median_depths[~inside])
 
 
+@_often("native")
 def test_pixels_of_three_gaussians_by_hand(form):
     """Numbers of gsplat's projection and a plain blend, to six decimals."""
     values = made_splats.joined(
@@ -182,6 +193,7 @@ def test_pixels_of_three_gaussians_by_hand(form):
         assert float(seen.transmittance[y, x]) == pytest.approx(left, abs=2e-6)
 
 
+@_often("native")
 def test_the_nearer_of_two_planes_is_in_front(form):
     near = made_splats.one((0, 0, 2), scale=(5, 5, 0.01), opacity=0.75, colour=(1, 0, 0))
     far = made_splats.one((0, 0, 3), scale=(5, 5, 0.01), opacity=0.75, colour=(0, 1, 0))
@@ -191,6 +203,7 @@ def test_the_nearer_of_two_planes_is_in_front(form):
         assert float(seen.median_depths[8, 8]) == 2.0
 
 
+@_often("native")
 def test_weights_and_transmittance_add_up_to_one(form, scene):
     values, view, *_ = scene
     white = values._replace(
@@ -203,6 +216,7 @@ def test_weights_and_transmittance_add_up_to_one(form, scene):
     np.testing.assert_allclose(seen.colours[..., 1] + left, 1.0, atol=1e-5)
 
 
+@_often("native")
 def test_the_order_of_gaussians_does_not_matter(form, scene):
     values, view, *_ = scene
     order = np.random.default_rng(3).permutation(300)
@@ -214,6 +228,7 @@ def test_the_order_of_gaussians_does_not_matter(form, scene):
         np.testing.assert_allclose(first, second, atol=1e-6)
 
 
+@_often("native")
 def test_moving_scene_and_camera_together_changes_nothing(form):
     """Quaternions are multiplied by that of the motion; colours without harmonics."""
     values, view = made_splats.gaussians(100), made_splats.view()
@@ -231,6 +246,7 @@ def test_moving_scene_and_camera_together_changes_nothing(form):
         assert np.mean(np.abs(np.asarray(first - second)) > 1e-4) < 1e-3
 
 
+@_often("native")
 def test_an_image_depends_on_neither_tiles_nor_capacity(form, scene):
     values, view, *_ = scene
     found = _PROJECT(values, view)
@@ -248,6 +264,7 @@ def _listed(projected, capacity):
     return images.make_lists(projected, _GRID, capacity=capacity)
 
 
+@_often("native")
 def test_lists_report_what_they_need(form):
     found = _PROJECT(made_splats.gaussians(300), made_splats.view())
     total = int(images.count_entries(found, _GRID))
@@ -282,6 +299,7 @@ def test_both_lists_are_equal():
     np.testing.assert_array_equal(both[0].entries[:total], both[1].entries[:total])
 
 
+@_often("native")
 def test_no_gaussians_and_empty_tiles(form):
     none = _image(splats.blank(0))
     assert np.all(none.transmittance == 1.0) and not np.any(none.colours)
@@ -291,6 +309,7 @@ def test_no_gaussians_and_empty_tiles(form):
     assert np.all(lonely.transmittance[8:, 8:] == 1.0) and lonely.transmittance.min() < 0.9
 
 
+@_often("chunks")
 def test_a_list_longer_than_a_chunk(form):
     """100 equal layers: the transmittance is a power, until it is below 1e-4."""
     layers = [made_splats.one((0, 0, 2 + 0.01 * n), scale=30, opacity=0.05) for n in range(100)]

@@ -20,7 +20,7 @@ from refref_jax.training.fit import Periods, fit, prepare
 from tests.factories.cut_ball import cut_ball
 from tests.factories.small_model import CAMERAS
 
-pytestmark = [pytest.mark.loose]
+pytestmark = [pytest.mark.loose, pytest.mark.longest]
 
 _ROUND = backdrop_solver.ROUND
 
@@ -109,6 +109,7 @@ def test_distances_are_those_of_the_walls_along_the_path(scene, run):
     assert np.median(error) < 1e-3 and np.quantile(error, 0.95) < 0.05
 
 
+@pytest.mark.slow
 def test_the_radiance_has_gradients_through_the_renderer(scene, run):
     frames, model = scene_folder.read_frames(scene, "train"), run[1]
     row = jax.tree.map(lambda x: x[64, ::16], image_rays(frames.cameras, 0))
@@ -248,6 +249,7 @@ def test_opaque_parts_lead_to_a_backdrop_with_a_field_in_front_of_it(filled):
         prepare(gains, report=lambda line: None)
 
 
+@pytest.mark.slow
 def test_a_run_stops_between_the_views_that_it_traces(scene, tmp_path):
     lines = []
     with pytest.raises(KeyboardInterrupt):

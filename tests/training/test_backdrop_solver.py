@@ -23,6 +23,8 @@ from refref_jax.training import backdrop_equations, backdrop_solver
 from refref_jax.training.backdrop_equations import Block
 from tests.factories import scenes
 
+pytestmark = pytest.mark.longest
+
 _RESOLUTION = 16
 _SKY = Domain(1.0, "unbounded")
 _TREE = dataclasses.replace(TREE, max_bends=5)
@@ -232,6 +234,7 @@ def test_parts_that_no_pixel_sees_become_clear(ball):
     np.testing.assert_allclose(learned_media.tints(last.tints), 1.0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_gains_of_the_images_are_found_with_the_radiance(ball):
     # One ring of cameras: images of separate parts of the surface have no common scale.
     views = cameras.orbit(10, distance=4.0, elevation=0.2, size=32, angle_x=1.6)
@@ -300,6 +303,7 @@ def test_rounds_with_other_pixels_come_close_to_all_pixels(ball):
         np.testing.assert_array_equal(ours, theirs)
 
 
+@pytest.mark.slow
 def test_the_equations_of_a_round_are_freed_before_the_next_are_made():
     alive = []
 
@@ -316,6 +320,7 @@ def test_the_equations_of_a_round_are_freed_before_the_next_are_made():
         _solve(draw)
 
 
+@pytest.mark.slow
 def test_radiance_that_is_linear_in_the_direction_is_recovered():
     # A grey cube that is brighter for light that travels up, seen from two rings of cameras.
     views, domain = _views(12, 32), Domain(6.0, "bounded")

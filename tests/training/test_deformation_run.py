@@ -16,7 +16,7 @@ from refref_jax.training.config import TrainConfig
 from tests.factories.small_model import CAMERAS
 from tests.processes.command import ROOT, run_command
 
-pytestmark = [pytest.mark.loose, pytest.mark.longest]
+pytestmark = pytest.mark.loose
 
 _SCENE = ROOT / "experiments" / "data" / "cube_smcvx_ball"
 _PERIODS = fit.Periods(log=1)

@@ -29,15 +29,21 @@ def _script():
     return script
 
 
-@pytest.fixture(scope="module")
-def fifty(tmp_path_factory):
-    """The folder of the README's script, after it has run."""
-    folder = tmp_path_factory.mktemp("script")
+def _execute(script, folder):
+    """Returns the folder of the run that the README's script leaves."""
     (folder / "experiments").symlink_to(ROOT / "experiments")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        exec(compile(_script(), "README.md", "exec"), {})
+        exec(compile(script, "README.md", "exec"), {})
     return folder / "runs" / "fifty"
+
+
+@pytest.fixture(scope="module")
+def four(tmp_path_factory):
+    """The folder of the README's script, after it has run with four steps and small sizes."""
+    small = "batch=64, pretraced_batches=4, samples_per_ray=(8, 6), log2_hashmap_size=10"
+    script = _script().replace("steps=50", f"steps=4, paths='paper', max_res=32, {small}")
+    return _execute(script.replace("size=128", "size=16"), tmp_path_factory.mktemp("script"))
 
 
 def test_the_script_of_the_readme_is_short_and_imports_the_library_alone():
@@ -50,19 +56,27 @@ def test_the_script_of_the_readme_is_short_and_imports_the_library_alone():
             assert node.module.split(".")[0] == "refref_jax"
 
 
-def test_the_script_of_the_readme_trains_and_renders(fifty):
+def test_the_script_of_the_readme_trains_and_renders_small_images(four):
+    assert run_folder.read_metrics(four)[-1]["step"] == 4
+    view = iio.imread(four / "view.png", plugin="pillow")
+    assert view.shape == (16, 16, 3) and view.std() > 0.0
+
+
+@pytest.mark.slow
+def test_the_script_of_the_readme_trains_and_renders(tmp_path):
+    fifty = _execute(_script(), tmp_path)
     lines = run_folder.read_metrics(fifty)
     assert lines[-1]["step"] == 50 and lines[-1]["psnr"] > 12.0
     view = iio.imread(fifty / "view.png", plugin="pillow")
     assert view.shape == (128, 128, 3) and view.std() > 10.0
 
 
-def test_the_configuration_of_a_run_repeats_it_bit_for_bit(fifty, tmp_path):
-    config = run_folder.read_config(fifty)
+def test_the_configuration_of_a_run_repeats_it_bit_for_bit(four, tmp_path):
+    config = run_folder.read_config(four)
     messages = []
     model = fit.fit(config, out=tmp_path / "again", report=messages.append)
     assert run_folder.read_config(tmp_path / "again") == config
-    first = checkpoint_io.load_model(fifty)
+    first = checkpoint_io.load_model(four)
     assert (first.config, first.settings) == (model.config, model.settings)
     pairs = zip(jax.tree.leaves(first.params), jax.tree.leaves(model.params), strict=True)
     assert all(np.array_equal(ours, again) for ours, again in pairs)
@@ -76,12 +90,12 @@ def test_the_configuration_of_a_run_repeats_it_bit_for_bit(fifty, tmp_path):
         fit.fit(config, out=tmp_path / "again")
 
 
-def test_a_model_is_loaded_without_a_word_and_nothing_is_written(fifty, caplog, capfd):
-    before = {path: path.stat().st_mtime_ns for path in fifty.rglob("*")}
-    checkpoint_io.load_model(fifty)
-    assert checkpoint_io.latest_step(fifty) == 50
+def test_a_model_is_loaded_without_a_word_and_nothing_is_written(four, caplog, capfd):
+    before = {path: path.stat().st_mtime_ns for path in four.rglob("*")}
+    checkpoint_io.load_model(four)
+    assert checkpoint_io.latest_step(four) == 4
     assert not caplog.records and capfd.readouterr() == ("", "")
-    assert before == {path: path.stat().st_mtime_ns for path in fifty.rglob("*")}
+    assert before == {path: path.stat().st_mtime_ns for path in four.rglob("*")}
 
 
 def test_what_is_asked_for_stays_where_the_path_of_the_scene_is_made_absolute(monkeypatch):

@@ -168,6 +168,7 @@ def test_wrong_options_are_refused_before_anything_is_compiled(changes, message,
         fit.prepare(_config(**changes), report=_quiet)
 
 
+@pytest.mark.slow
 def test_presets_have_their_numbers_and_say_only_what_splats_read():
     for name, preset in presets.PRESETS.items():
         resolved, _ = fit.prepare(_config(preset=name, gaussians=None), report=_quiet)
@@ -180,6 +181,7 @@ def test_presets_have_their_numbers_and_say_only_what_splats_read():
     assert field.model.config.splats is None and field.config.get("gaussians") is None
 
 
+@pytest.mark.slow
 def test_nothing_of_splats_is_imported_without_them():
     code = (
         "import sys, refref_jax, refref_jax.render, refref_jax.training.fit, experiments.train;"

@@ -15,7 +15,7 @@ from refref_jax.training.config import TrainConfig
 from tests.factories.small_model import CAMERAS
 from tests.processes.command import ROOT, run_command
 
-pytestmark = [pytest.mark.loose, pytest.mark.longest]
+pytestmark = pytest.mark.loose
 
 _SCENE = ROOT / "experiments" / "data" / "cube_smcvx_ball"
 
@@ -37,6 +37,7 @@ def trained(tmp_path_factory):
     return made, run
 
 
+@pytest.mark.slow
 def test_some_steps_lower_the_loss(trained):
     lines = run_folder.read_metrics(trained[1])
     losses = [line["loss"] for line in lines]
@@ -44,6 +45,7 @@ def test_some_steps_lower_the_loss(trained):
     assert all(np.isfinite([line["interlevel"], line["distortion"]]).all() for line in lines)
 
 
+@pytest.mark.slow
 def test_a_checkpoint_is_read_as_it_was_written(trained):
     made, run = trained
     read = checkpoint_io.load_model(run)

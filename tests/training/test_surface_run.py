@@ -26,7 +26,7 @@ from tests.factories import scenes
 from tests.factories.small_model import CAMERAS
 from tests.processes.command import ROOT, run_command
 
-pytestmark = [pytest.mark.loose, pytest.mark.longest]
+pytestmark = pytest.mark.loose
 
 _SCENE = ROOT / "experiments" / "data" / "cube_smcvx_ball"
 _PERIODS = fit.Periods(log=1)
@@ -149,10 +149,7 @@ def _config(**changes):
     return TrainConfig().override(scene=str(_SCENE), pretraced_batches=4, **small, **given)
 
 
-_SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("unisurf", "nunerf")]
-
-
-@pytest.fixture(scope="module", params=["neus", *_SLOW])
+@pytest.fixture(scope="module", params=["neus", "unisurf", "nunerf"])
 def trained(request, tmp_path_factory):
     """A model, and the folder of its run."""
     run = tmp_path_factory.mktemp(request.param) / "run"
@@ -161,6 +158,7 @@ def trained(request, tmp_path_factory):
     return made, run
 
 
+@pytest.mark.slow
 def test_some_steps_lower_the_loss(trained):
     lines = run_folder.read_metrics(trained[1])
     losses = [line["loss"] for line in lines]
@@ -169,6 +167,7 @@ def test_some_steps_lower_the_loss(trained):
         assert np.isfinite([line[name] for line in lines]).all()
 
 
+@pytest.mark.slow
 def test_a_checkpoint_is_read_as_it_was_written(trained):
     made, run = trained
     read = checkpoint_io.load_model(run)

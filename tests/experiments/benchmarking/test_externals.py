@@ -93,6 +93,7 @@ def test_folders_are_those_of_scenes_or_of_the_only_one(tmp_path, both):
     assert skipped.name == "env_mmncvx_cup/mine" and "test views cannot be read" in skipped.reason
 
 
+@pytest.mark.slow
 def test_a_job_measures_copies_and_again_when_a_file_has_changed(tmp_path, both, stand_in):
     scenes, mine = both
     given, out = External("mine", str(mine)), tmp_path / "out"

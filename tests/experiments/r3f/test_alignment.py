@@ -133,6 +133,7 @@ def test_derivatives_of_a_placement_are_central_differences(size):
     np.testing.assert_array_equal(placed.vertices, part.vertices)
 
 
+@pytest.mark.slow
 def test_outlines_place_an_object_that_lies_wrong():
     cameras = bodies.cameras_around(12, size=160, distance=4.0)
     views = Views(bodies.masks_of(_ellipsoid, cameras, steps=120), cameras)
@@ -152,6 +153,7 @@ def test_an_object_without_parts_is_refused():
         PlacedObject([], nested([], []))
 
 
+@pytest.mark.slow
 def test_creases_have_outlines_of_their_own():
     """A box of twelve triangles has no other points where it turns away from a camera."""
     cameras = bodies.cameras_around(12, size=160, distance=4.0)

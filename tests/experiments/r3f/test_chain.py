@@ -420,7 +420,7 @@ def test_bubbles_come_with_the_shape_that_is_chosen(scene, monkeypatch, tmp_path
     np.testing.assert_allclose(radii, bubble.radius, rtol=1e-5)
 
 
-@pytest.mark.parametrize("is_vessel", [True, False])
+@pytest.mark.parametrize("is_vessel", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_opaque_ends_are_parts_of_vessels_alone(scene, monkeypatch, tmp_path, is_vessel):
     outer = vessels.bottle()
     top, colour = float(outer.points[:, 1].max()), (0.02, 0.05, 0.3)
@@ -526,7 +526,9 @@ def test_training_views_judge_where_there_are_no_validation_masks(scene, tmp_pat
 @pytest.mark.parametrize(
     ("target", "options"),
     [
-        ("refref_jax.data.meshes.write_mesh", {"after": True}),  # before the renaming
+        pytest.param(  # before the renaming
+            "refref_jax.data.meshes.write_mesh", {"after": True}, marks=pytest.mark.slow
+        ),
         ("experiments.r3f.light_stage.run", {"after": True}),  # renamed, not recorded
     ],
 )

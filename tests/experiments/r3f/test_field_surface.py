@@ -3,7 +3,6 @@
 import dataclasses
 import shutil
 
-import jax
 import numpy as np
 import pytest
 
@@ -14,11 +13,10 @@ from refref_jax.geometry.triangle_meshes import volume
 from refref_jax.reconstruct.grids import Grid, find_isosurface
 from refref_jax.reconstruct.masks import overlaps
 from refref_jax.render import Model
-from refref_jax.render.model import ball_of, init_params
+from refref_jax.render.model import ball_of
 from tests.factories import bodies
 from tests.factories.silhouettes import without_masks, write_scene
-
-pytestmark = [pytest.mark.computing]
+from tests.factories.small_model import initial
 
 _CONFIG = ReconstructionConfig("neus", 32, 0, 1.5, "bounded", 4.0, "none", 0)
 
@@ -41,11 +39,12 @@ def untrained(monkeypatch):
 
     def learned(scene, run, wanted):
         saved = wanted.model
-        params = init_params(jax.random.key(0), saved.config)
+        params = initial(saved.config)
         asked.append((run, Model(saved.config, saved.settings, None, params)))
         return asked[-1][1]
 
     monkeypatch.setattr(index_stage, "learned", learned)
+    monkeypatch.setattr(field_surface, "_COARSE", 24)
     return asked
 
 

@@ -109,6 +109,7 @@ def test_no_field_is_trained_where_only_a_backdrop_is_of_use(ball_scene, tmp_pat
     assert not (tmp_path / "background").exists()
 
 
+@pytest.mark.slow
 def test_a_background_that_was_begun_with_other_walls_is_not_taken(
     ball_scene, tmp_path, monkeypatch
 ):
