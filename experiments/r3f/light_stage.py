@@ -50,9 +50,10 @@ from refref_jax.reconstruct.families import Revolution
 from refref_jax.reconstruct.interior_looks import SearchSettings
 from refref_jax.reconstruct.interior_search import Finding
 from refref_jax.reconstruct.interiors import Solid, Vessel
-from refref_jax.reconstruct.masks import Outlines, Views, fit_profile
+from refref_jax.reconstruct.masks import Views
 from refref_jax.reconstruct.model_selection import Trial
 from refref_jax.reconstruct.opaque_ends import OpaqueEnd
+from refref_jax.reconstruct.outlines import Outlines, fit_profile
 from refref_jax.reconstruct.photometry import Backdrop, Photographs
 from refref_jax.reconstruct.refinement import objection
 from refref_jax.reconstruct.relief import measure_relief

@@ -6,10 +6,11 @@ from scipy.ndimage import binary_dilation
 
 from refref_jax.optics.interface_rules import NO_PARENT, nested
 from refref_jax.reconstruct import gauss_newton
-from refref_jax.reconstruct import masks as outlines_module
+from refref_jax.reconstruct import outlines as outlines_module
 from refref_jax.reconstruct.families import Revolution, Sphere
 from refref_jax.reconstruct.gauss_newton import Candidate, Equations, Rows
-from refref_jax.reconstruct.masks import Outlines, Views, fit_profile
+from refref_jax.reconstruct.masks import Views
+from refref_jax.reconstruct.outlines import Outlines, fit_profile
 from refref_jax.reconstruct.revolution import Axis, Profile
 from refref_jax.reconstruct.shape_from_refraction import SingleObject
 from refref_jax.reconstruct.shapes import FixedShape, FreeSurface

@@ -13,8 +13,9 @@ from refref_jax.geometry.triangle_meshes import (
 from refref_jax.reconstruct.contents import Detail, Interior
 from refref_jax.reconstruct.families import Revolution, fit_revolution
 from refref_jax.reconstruct.interiors import Vessel
-from refref_jax.reconstruct.masks import Outlines, Views, fit_profile
+from refref_jax.reconstruct.masks import Views
 from refref_jax.reconstruct.mesh_distance import signed_distance
+from refref_jax.reconstruct.outlines import Outlines, fit_profile
 from refref_jax.reconstruct.relief import Relief, measure_relief
 from refref_jax.reconstruct.revolution import Axis, Profile
 from tests.factories import bodies, revolved, vessels
