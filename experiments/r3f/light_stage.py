@@ -272,7 +272,7 @@ def look_at_ends(
     if outer is None:
         return RevolvedObject(None)
     relief = measure_relief(mesh, outer.axis)
-    outer = fit_profile(outer, Outlines(read_views(scene), seed=seed), relief=relief)
+    outer = fit_profile(outer, read_views(scene), relief=relief, seed=seed)
     ends = opaque_ends.find_opaque_ends(outer, surface, seen.fitted, seed=seed)
     return RevolvedObject(outer, ends)
 

@@ -167,6 +167,22 @@ def signed_distances(
     return smooth - 0.5 * blur**2 * gaussian_laplace(steps, blur, mode="nearest")
 
 
+def sample_with_slope(
+    image: Float[np.ndarray, "h w"], pixels: Float[np.ndarray, "points 2"]
+) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, "points 2"]]:
+    """Returns an image, whose values are at the centres of pixels, and its slope at points."""
+    height, width = image.shape
+    place = np.clip(pixels - 0.5, 0.0, [width - 1.001, height - 1.001])
+    column, row = place.astype(np.int64).T
+    right, down = (place - np.stack([column, row], axis=-1)).T
+    a, b = image[row, column], image[row, column + 1]
+    c, d = image[row + 1, column], image[row + 1, column + 1]
+    value = (1.0 - down) * ((1.0 - right) * a + right * b) + down * ((1.0 - right) * c + right * d)
+    along = (1.0 - down) * (b - a) + down * (d - c)
+    across = (1.0 - right) * (c - a) + right * (d - b)
+    return value, np.stack([along, across], axis=-1)
+
+
 def _listed(views: Int[np.ndarray, " views"]) -> str:
     """Returns the numbers of the first few views, as text."""
     names = ", ".join(str(view) for view in views[:5])

@@ -9,7 +9,9 @@ about a third of a pixel. Masks that are wrong, or show something else, lose the
 
 `fit_profile` fits a body of revolution to outlines alone. A mesh from masks is up to half a pixel
 too narrow and has waves along its profile; the outlines of all views together determine it to some
-hundredths of a pixel, and its normals to half a degree.
+hundredths of a pixel, and its normals to half a degree. Smoothed distances hide what is narrower
+than three pixels, such as rings and threads. Which pixels are in a mask shows it, since the rays
+through their centres pass at all heights: a body is fitted to them by how deep each enters it.
 
 Source: Cipolla and Blake, Surface Shape from the Deformation of Apparent Contours (1992), for the
 derivative; its use beside refraction is ours.
@@ -21,16 +23,20 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
+from scipy.special import expit
 
-from refref_jax.geometry.cameras import Cameras, project
+from refref_jax.geometry.cameras import Projection, pixel_rays, project, projection_slopes
+from refref_jax.geometry.rays import Rays
 from refref_jax.geometry.triangle_meshes import unit_vectors
 from refref_jax.reconstruct import ReconstructionError
 from refref_jax.reconstruct.families import Revolution
 from refref_jax.reconstruct.gauss_newton import Candidate, Rows
-from refref_jax.reconstruct.masks import Views, signed_distances
+from refref_jax.reconstruct.masks import Views, sample_with_slope, signed_distances
 from refref_jax.reconstruct.relief import Relief
-from refref_jax.reconstruct.shapes import Posed
+from refref_jax.reconstruct.revolution import Curve
+from refref_jax.reconstruct.shapes import Posed, Unknowns, tilt
 
 OUTLINE_DEVIATION = 0.3
 """Standard deviation of a signed distance, the unit of the errors of outlines, in pixels."""
@@ -45,6 +51,24 @@ _POINTS = 100
 # Steps of the fit of a profile, and the standard deviation of the second differences of its knots,
 # as a share of the diameter: neighbouring points have errors that are alike.
 _ROUNDS, _BEND = 5, 0.001
+
+# Pixels that are nearer to an outline than this are fitted to, in pixels; one view in so many
+# judges; numbers of pixels; and the share of wrong ones below which there are no ridges.
+_BESIDE, _JUDGE_EVERY, _FITTED, _JUDGES, _FEW_WRONG = 1.8, 5, 16_000, 8_000, 0.015
+
+# Scale of the logistic function of a depth, in pixels, and share of the pixels that are wrong.
+_MASK_DEVIATION, _MISTAKES = 0.15, 0.02
+
+# Knots of a fine profile, scale of the second differences of its offsets as a share of the
+# diameter, largest number of steps, and a gain in the logarithm of the probability that ends them.
+_FINE_KNOTS, _FINE_BEND, _FINE_ROUNDS, _LEAST_GAIN = 200, 0.0002, 16, 2.0
+
+# Damping of the first step, factor of those after it, and the largest one.
+_DAMPING, _DAMPING_STEP, _MOST_DAMPING = 0.1, 6.0, 100.0
+
+# Pieces of each segment of a profile. Places that are tried on a ray, three times ever finer.
+_PIECES, _AROUND = 3, 1.2
+_TICKS = (np.linspace(-1.0, 1.0, 41), np.linspace(-1.0, 1.0, 9), np.linspace(-1.0, 1.0, 9))
 
 # Cosine of the angle between normals at a crease, and points along it.
 _CREASE, _ALONG_CREASE = math.cos(math.radians(10.0)), 12
@@ -160,12 +184,15 @@ class Outlines:
         share = rim.share[:, None]
         points = (1.0 - share) * part.vertices[rim.first] + share * part.vertices[rim.second]
         seen = project(points, pose, self._cameras)
-        distance, slope = _sample(distances, seen.pixels)
+        distance, slope = sample_with_slope(distances, seen.pixels)
         size = np.array([self._cameras.width, self._cameras.height])
         visible = (seen.depths > 0.0) & np.all((seen.pixels > 0) & (seen.pixels < size), axis=-1)
         near = np.flatnonzero((np.abs(distance) < self._reach) & visible)
         near = generator.permutation(near)[:_POINTS]
-        rows = _by_points(slope[near], seen.pixels[near], seen.depths[near], pose, self._cameras)
+        by_column, by_row = projection_slopes(
+            Projection(*(x[near] for x in seen)), pose, self._cameras
+        )
+        rows = slope[near, :1] * by_column + slope[near, 1:] * by_row
         first, second = rim.first[near], rim.second[near]
         blocks = np.concatenate([(1.0 - share[near]) * rows, share[near] * rows], axis=1)
         at = 3 * np.stack([first, second], axis=1)[..., None] + np.arange(3)
@@ -176,22 +203,31 @@ class Outlines:
 
 
 def fit_profile(
-    outer: Revolution, outlines: Outlines, *, relief: Relief | None = None
+    outer: Revolution, views: Views, *, relief: Relief | None = None, seed: int = 0
 ) -> Revolution:
     """Fits a body of revolution to outlines alone.
 
+    It gets a relief, and then narrow ridges such as rings and threads, only if the masks are
+    explained better by them.
+
     Args:
       outer: a body near the outlines, such as that of a mesh from masks.
-      outlines: the outlines.
-      relief: possible difference from a body of revolution. The body gets it only if the
-        outlines are explained better by it: meshes from masks have such a relief in hollows, too.
+      views: masks and their cameras.
+      relief: possible difference from a body of revolution; meshes from masks have one in hollows,
+        too.
+      seed: seed of the draws of points and pixels.
     """
+    outlines = Outlines(views, seed=seed)
     found = _fitted(outer.with_relief(None), outlines)
-    if relief is None:
+    if relief is not None:
+        raised = _fitted(found.with_relief(relief), outlines)
+        found = raised if _error(raised, outlines) < _BETTER * _error(found, outlines) else found
+    fitted, judges = _pixels_beside(views, seed=seed)
+    wrong, surprise = _judged(found, judges)
+    if wrong < _FEW_WRONG:
         return found
-    raised = _fitted(found.with_relief(relief), outlines)
-    better = _error(raised, outlines) < _BETTER * _error(found, outlines)
-    return raised if better else found
+    fine = _fitted_to_pixels(found.with_knots(_FINE_KNOTS), fitted)
+    return fine if _judged(fine, judges)[1] < _BETTER * surprise else found
 
 
 def _fitted(outer: Revolution, outlines: Outlines) -> Revolution:
@@ -209,6 +245,199 @@ def _error(outer: Revolution, outlines: Outlines) -> float:
     """Returns the mean distance from the outlines, in standard deviations, up to the largest."""
     errors = outlines.of_surface(outer.pose(outer.start())).errors
     return float(np.mean(np.minimum(np.abs(errors), _WRONG / OUTLINE_DEVIATION)))
+
+
+class _Pixels(NamedTuple):
+    """Pixels beside the outlines of masks.
+
+    Attributes:
+      rays: rays through their centres.
+      inside: whether they are in a mask.
+      share: number of these pixels as a share of all that were found.
+    """
+
+    rays: Rays
+    inside: Bool[np.ndarray, " pixels"]
+    share: float
+
+
+def _pixels_beside(views: Views, *, seed: int) -> tuple[_Pixels, _Pixels]:
+    """Returns pixels to fit, and pixels of other views, which judge."""
+    generator = np.random.default_rng(seed)
+    distances = [signed_distances(mask, blur=0.0) for mask in views.masks]
+    beside = np.argwhere(np.abs(np.stack(distances)) < _BESIDE)
+    judging = beside[:, 0] % _JUDGE_EVERY == 0
+    found = []
+    for some, count in ((beside[~judging], _FITTED), (beside[judging], _JUDGES)):
+        view, row, column = generator.permutation(some)[:count].T
+        rays = pixel_rays(views.cameras, view, row, column)
+        share = len(view) / max(len(some), 1)
+        found.append(_Pixels(rays, views.masks[view, row, column], share))
+    return found[0], found[1]
+
+
+class _Deepest(NamedTuple):
+    """The point of each ray that is deepest inside a body, or nearest to it.
+
+    Attributes:
+      depths: distances from the surface in pixels, positive inside.
+      points: the points, in the frame of the axis before it was tilted and shifted.
+      normals: radial and axial part of the normal of the nearest point of the profile.
+      segment: segment of this point.
+      share: its place on the segment.
+      pixel: width of a pixel there, world units.
+    """
+
+    depths: Float[np.ndarray, " rays"]
+    points: Float[np.ndarray, "rays 3"]
+    normals: Float[np.ndarray, "rays 2"]
+    segment: Int[np.ndarray, " rays"]
+    share: Float[np.ndarray, " rays"]
+    pixel: Float[np.ndarray, " rays"]
+
+
+def _deepest(body: Revolution, x: Unknowns, rays: Rays) -> _Deepest:
+    """Finds where rays are deepest inside a body at given unknowns."""
+    axis, profile = body.axis, body.profile(x)
+    origins = (np.asarray(rays.origins, np.float64) - axis.point) @ axis.frame
+    origins -= np.append(x[2:4], 0.0)
+    directions = np.asarray(rays.directions, np.float64) @ axis.frame
+    tilted = tilt(x[:2])[0]
+    share = np.arange(_PIECES)[:, None] / _PIECES
+    last = len(profile.points) - (0 if body.closed else 1)
+    points, normals = (
+        ((1.0 - share) * of[:, None] + share * np.roll(of, -1, axis=0)[:, None])[:last].reshape(
+            -1, 2
+        )
+        for of in (profile.points, profile.normals)
+    )
+    tree = KDTree(points)
+
+    def depths(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        local = (origins[:, None] + t[..., None] * directions[:, None]).reshape(-1, 3) @ tilted
+        local = local if body.relief is None else body.relief.shrink(local)
+        flat = np.stack([np.hypot(local[:, 0], local[:, 1]), local[:, 2]], axis=-1)
+        nearest = tree.query(flat)[1]
+        away = np.sum(normals[nearest] * (flat - points[nearest]), axis=-1)
+        return -away.reshape(t.shape), nearest.reshape(t.shape)
+
+    t, half = _within(profile.points, origins, directions)
+    each = np.arange(len(t))
+    for ticks in _TICKS:
+        tried = t[:, None] + half[:, None] * ticks
+        found, nearest = depths(tried)
+        best = np.argmax(found, axis=1)
+        t, half = tried[each, best], half * (ticks[1] - ticks[0])
+    nearest = nearest[each, best]
+    pixel = 0.5 * math.sqrt(12.0) * np.asarray(rays.radii, np.float64) * t
+    return _Deepest(
+        found[each, best] / pixel,
+        origins + t[:, None] * directions,
+        normals[nearest] / np.linalg.norm(normals[nearest], axis=-1, keepdims=True),
+        nearest // _PIECES,
+        (nearest % _PIECES) / _PIECES,
+        pixel,
+    )
+
+
+def _within(
+    profile: Curve, origins: Float[np.ndarray, "rays 3"], directions: Float[np.ndarray, "rays 3"]
+) -> tuple[Float[np.ndarray, " rays"], Float[np.ndarray, " rays"]]:
+    """Returns the middle and half the length of each ray within a cylinder around a profile."""
+    flat = np.maximum(np.sum(directions[:, :2] ** 2, axis=-1), 1e-12)
+    near = -np.sum(origins[:, :2] * directions[:, :2], axis=-1) / flat
+    away = np.linalg.norm(origins[:, :2] + near[:, None] * directions[:, :2], axis=-1)
+    radius = np.maximum(_AROUND * profile[:, 0].max(), away)
+    half = np.sqrt((radius**2 - away**2) / flat)
+    steep = np.where(np.abs(directions[:, 2]) > 1e-9, directions[:, 2], 1e-9)
+    low, high = profile[:, 1].min(), profile[:, 1].max()
+    margin = 0.5 * (_AROUND - 1.0) * (high - low)
+    limits = [(low - margin, high + margin)] - origins[:, 2:]
+    limits = np.sort(limits / steep[:, None], axis=-1)
+    first = np.clip(limits[:, 0], near - half, near + half)
+    last = np.clip(limits[:, 1], near - half, near + half)
+    return 0.5 * (first + last), 0.5 * (last - first)
+
+
+def _depths_by_unknowns(
+    body: Revolution, x: Unknowns, deepest: _Deepest
+) -> Float[np.ndarray, "rays unknowns"]:
+    """Returns the derivatives of the depths; how a relief turns normals is left out."""
+    share, segment = deepest.share[:, None, None], deepest.segment
+    moved = body.profile(x).by_points
+    moved = (1.0 - share) * moved[segment] + share * np.roll(moved, -1, axis=0)[segment]
+    tilted, *by_angles = tilt(x[:2])
+    local = deepest.points @ tilted
+    radial = local[:, :2] / np.maximum(np.linalg.norm(local[:, :2], axis=-1), 1e-12)[:, None]
+    normals = np.concatenate([deepest.normals[:, :1] * radial, deepest.normals[:, 1:]], axis=-1)
+    turned = [-np.sum(normals * (deepest.points @ by), axis=-1) for by in by_angles]
+    shifted = normals @ tilted[:2].T
+    offsets = np.einsum("nk,nkm->nm", deepest.normals, moved)
+    rows = np.concatenate([np.stack(turned, axis=-1), shifted, offsets], axis=-1)
+    return rows / deepest.pixel[:, None]
+
+
+def _surprises(
+    depths: Float[np.ndarray, " rays"], inside: Bool[np.ndarray, " rays"]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns minus the logarithm of the probability of each pixel's mask; slope and curvature.
+
+    The probability that a pixel is in a mask is a logistic function of its depth; a small share of
+    the pixels is wrong.
+    """
+    logistic = expit(depths / _MASK_DEVIATION)
+    likely = _MISTAKES + (1.0 - 2.0 * _MISTAKES) * logistic
+    slope = (1.0 - 2.0 * _MISTAKES) * logistic * (1.0 - logistic) / _MASK_DEVIATION
+    of_mask = np.where(inside, likely, 1.0 - likely)
+    return (
+        -np.log(of_mask),
+        np.where(inside, -slope, slope) / of_mask,
+        slope**2 / (likely * (1.0 - likely)),
+    )
+
+
+def _judged(body: Revolution, pixels: _Pixels) -> tuple[float, float]:
+    """Returns the share of pixels on whose masks a body is wrong, and the mean of `_surprises`."""
+    depths = _deepest(body, body.start(), pixels.rays).depths
+    wrong = np.mean((depths > 0.0) != pixels.inside)
+    return float(wrong), float(np.mean(_surprises(depths, pixels.inside)[0]))
+
+
+def _fitted_to_pixels(body: Revolution, pixels: _Pixels) -> Revolution:
+    """Fits a body to which pixels are in masks, by the rays through their centres.
+
+    Second differences of the offsets have a Cauchy distribution: few are large, at ridges and rims.
+    """
+    bends = np.zeros((len(body.bends()), 4 + body.knots))
+    bends[:, 4:] = body.bends() / (_FINE_BEND * body.size)
+    loose, _ = body.prior(body.start(), bend=math.inf)
+
+    def look(x: Unknowns) -> tuple[float, _Deepest]:
+        deepest = _deepest(body, x, pixels.rays)
+        surprise = np.sum(_surprises(deepest.depths, pixels.inside)[0]) / pixels.share
+        prior = 0.5 * x @ loose @ x + np.sum(np.log1p((bends @ x) ** 2))
+        return float(surprise + prior), deepest
+
+    x, damping = body.start(), _DAMPING
+    energy, deepest = look(x)
+    for _ in range(_FINE_ROUNDS):
+        rows = _depths_by_unknowns(body, x, deepest)
+        _, slopes, weights = _surprises(deepest.depths, pixels.inside)
+        robust = 2.0 / (1.0 + (bends @ x) ** 2)
+        precision = loose + (bends.T * robust) @ bends
+        matrix = (rows.T * weights) @ rows / pixels.share + precision
+        gradient = rows.T @ slopes / pixels.share + precision @ x
+        gain = 0.0
+        while gain <= 0.0 and damping < _MOST_DAMPING:
+            step = np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), -gradient)
+            lower, there = look(x + step)
+            gain = energy - lower
+            damping *= _DAMPING_STEP if gain <= 0.0 else 1.0 / _DAMPING_STEP
+        if gain > 0.0:
+            x, energy, deepest = x + step, lower, there
+        if gain < _LEAST_GAIN:
+            break
+    return body.moved(x)
 
 
 def _vertex_normals(part: Posed) -> Float[np.ndarray, "vertices 3"]:
@@ -263,37 +492,3 @@ def _rim(
     turns = np.flatnonzero((first > 0.0) != (second > 0.0))
     share = first[turns] / (first[turns] - second[turns])
     return _Rim(edges[turns, 0], edges[turns, 1], share)
-
-
-def _sample(
-    image: Float[np.ndarray, "h w"], pixels: Float[np.ndarray, "points 2"]
-) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, "points 2"]]:
-    """Returns an image, whose values are at the centres of pixels, and its slope at points."""
-    height, width = image.shape
-    place = np.clip(pixels - 0.5, 0.0, [width - 1.001, height - 1.001])
-    column, row = place.astype(np.int64).T
-    right, down = (place - np.stack([column, row], axis=-1)).T
-    a, b = image[row, column], image[row, column + 1]
-    c, d = image[row + 1, column], image[row + 1, column + 1]
-    value = (1.0 - down) * ((1.0 - right) * a + right * b) + down * ((1.0 - right) * c + right * d)
-    along = (1.0 - down) * (b - a) + down * (d - c)
-    across = (1.0 - right) * (c - a) + right * (d - b)
-    return value, np.stack([along, across], axis=-1)
-
-
-def _by_points(
-    slope: Float[np.ndarray, "points 2"],
-    pixels: Float[np.ndarray, "points 2"],
-    depths: Float[np.ndarray, " points"],
-    pose: Float[np.ndarray, "3 4"],
-    cameras: Cameras,
-) -> Float[np.ndarray, "points 3"]:
-    """Returns the derivatives of the signed distance by a point in world units."""
-    middle = 0.5 * np.array([cameras.width, cameras.height])
-    x, y = (pixels - middle).T / cameras.focal
-    right, up, back = pose[:, 0], pose[:, 1], pose[:, 2]
-    scale = cameras.focal / depths
-    # A pixel is middle + focal (x, -y) / depth, and depth is along minus the third axis.
-    by_column = scale[:, None] * (right + x[:, None] * back)
-    by_row = scale[:, None] * (-up + y[:, None] * back)
-    return slope[:, :1] * by_column + slope[:, 1:] * by_row
