@@ -223,6 +223,8 @@ def fit_profile(
         raised = _fitted(found.with_relief(relief), outlines)
         found = raised if _error(raised, outlines) < _BETTER * _error(found, outlines) else found
     fitted, judges = _pixels_beside(views, seed=seed)
+    if not len(fitted.inside) or not len(judges.inside):  # of a single view
+        return found
     wrong, surprise = _judged(found, judges)
     if wrong < _FEW_WRONG:
         return found

@@ -181,6 +181,12 @@ def test_a_profile_far_from_all_outlines_stays_as_it_is(views):
     np.testing.assert_allclose(np.linalg.norm(found.points, axis=-1), 0.5, atol=1e-3)
 
 
+def test_a_single_view_fits_a_profile(views):
+    cameras = views.cameras._replace(poses=views.cameras.poses[:1])
+    found = fit_profile(_upright(_round(0.96)), Views(views.masks[:1], cameras))
+    assert np.all(np.isfinite(found.points)) and found.points[:, 0].max() > 0.97
+
+
 def _upright(points, **options):
     """A body of revolution about z with a profile."""
     points = np.array(points)
