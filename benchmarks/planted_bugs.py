@@ -434,7 +434,7 @@ BUGS = (
     ),
     Bug(
         "rows of an image upwards",
-        "reconstruct/masks.py",
+        "geometry/cameras.py",
         "by_row = scale[:, None] * (-up + y[:, None] * back)",
         "by_row = scale[:, None] * (up + y[:, None] * back)",
         ("reconstruct/test_outlines.py",),

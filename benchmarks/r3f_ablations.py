@@ -20,9 +20,9 @@ from experiments.r3f import index_stage, light_stage, object_source, records
 from refref_jax.data import meshes
 from refref_jax.data.scene_assembly import shaded_mesh
 from refref_jax.geometry.triangle_meshes import Mesh
-from refref_jax.reconstruct.masks import Outlines
 from refref_jax.reconstruct.mesh_distance import compare_meshes
 from refref_jax.reconstruct.model_selection import Trial
+from refref_jax.reconstruct.outlines import Outlines
 from refref_jax.reconstruct.photometry import Backdrop
 from refref_jax.reconstruct.shape_from_refraction import (
     FreeSurfaceSettings,

@@ -24,7 +24,7 @@ from refref_jax.geometry.cameras import Cameras, focal_length
 from refref_jax.geometry.triangle_meshes import Mesh, make_mesh, volume
 from refref_jax.reconstruct.convex import depth_below_hull, hull
 from refref_jax.reconstruct.grids import find_isosurface
-from refref_jax.reconstruct.masks import Views
+from refref_jax.reconstruct.masks import Views, carve
 from refref_jax.reconstruct.mesh_distance import (
     Distance,
     compare_meshes,
@@ -32,7 +32,6 @@ from refref_jax.reconstruct.mesh_distance import (
     silhouettes,
 )
 from refref_jax.reconstruct.refinement import PAPER, Refinement, Stage, refine, remesh
-from refref_jax.reconstruct.visual_hull import carve
 
 _VIEWS = flags.DEFINE_integer("views", 60, "Views to carve with.")
 _SIZE = flags.DEFINE_integer("size", 128, "Width and height of the masks in pixels.")

@@ -2,7 +2,7 @@
 
     python -m benchmarks.r3f_occupancy [--scene=FOLDER] [--masks=given,uneven,shifted]
 
-The training masks of a scene are carved (`visual_hull`), and an occupancy field is trained on them
+The training masks of a scene are carved (`masks.carve`), and an occupancy field is trained on them
 (`occupancy`); both surfaces are then refined. The table shows the mean distance from the true mesh
 (share of the diameter), the mean angle between the normals, the overlap of silhouettes in test
 views, and the volume.
@@ -27,7 +27,7 @@ from refref_jax.geometry.cameras import Cameras
 from refref_jax.geometry.triangle_meshes import Mesh, make_mesh, volume
 from refref_jax.reconstruct import occupancy
 from refref_jax.reconstruct.grids import Grid, find_isosurface
-from refref_jax.reconstruct.masks import Views
+from refref_jax.reconstruct.masks import Views, carve
 from refref_jax.reconstruct.mesh_distance import (
     Distance,
     compare_meshes,
@@ -36,7 +36,6 @@ from refref_jax.reconstruct.mesh_distance import (
 )
 from refref_jax.reconstruct.occupancy import OccupancyTrainingConfig
 from refref_jax.reconstruct.refinement import Refinement, refine
-from refref_jax.reconstruct.visual_hull import carve
 
 Masks = Bool[np.ndarray, "views h w"]
 

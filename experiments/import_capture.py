@@ -37,7 +37,7 @@ with epy.lazy_imports():
     from experiments.captures import capture as captures
     from experiments.captures import colmap, export, nerfstudio, scenes, world
     from refref_jax.data import meshes as mesh_files
-    from refref_jax.reconstruct import visual_hull
+    from refref_jax.reconstruct.masks import REACH
 
 _SOURCE = flags.DEFINE_string("source", None, "Folder or transforms.json to import.", required=True)
 _OUT = cli_flags.out("Folder to write, which must not exist.")
@@ -423,7 +423,7 @@ def _tell_placement(poses: np.ndarray, where: Placement, ball: Ball | None) -> N
         print(f"Object:  radius {where.scale * ball.radius:.3g}, {middle:.3g} from the origin")
     else:
         print(
-            f"R3F searches for the object within {visual_hull.REACH} units of the origin along "
+            f"R3F searches for the object within {REACH} units of the origin along "
             "each axis: use --centre and --scale if it is elsewhere."
         )
 

@@ -35,8 +35,8 @@ from refref_jax.optics.interface_rules import NO_PARENT, nested
 from refref_jax.optics.media import Interfaces
 from refref_jax.reconstruct import ReconstructionError, gauss_newton, model_selection
 from refref_jax.reconstruct.gauss_newton import Candidate, Fit, Steps
-from refref_jax.reconstruct.masks import OUTLINE_DEVIATION, Outlines
 from refref_jax.reconstruct.model_selection import Trial
+from refref_jax.reconstruct.outlines import OUTLINE_DEVIATION, Outlines
 from refref_jax.reconstruct.photometry import Backdrop
 from refref_jax.reconstruct.shapes import LARGEST_STEP, LARGEST_TURN, Posed
 

@@ -15,9 +15,9 @@ from experiments.r3f.records import GeometryFacts, ReconstructionConfig
 from refref_jax import atomic_files
 from refref_jax.data import meshes, scene_folder, scene_names
 from refref_jax.geometry.triangle_meshes import Mesh, diameter, volume
-from refref_jax.reconstruct import occupancy, visual_hull
+from refref_jax.reconstruct import occupancy
 from refref_jax.reconstruct.grids import Grid, find_isosurface
-from refref_jax.reconstruct.masks import Views
+from refref_jax.reconstruct.masks import Views, carve
 from refref_jax.reconstruct.mesh_distance import carved_alone, silhouette_overlap, without_outliers
 from refref_jax.reconstruct.occupancy import OccupancyTrainingConfig
 from refref_jax.reconstruct.refinement import Refinement, refine
@@ -56,7 +56,7 @@ class Inputs(NamedTuple):
 
 
 def _hull(inputs: Inputs, config: ReconstructionConfig) -> Grid:
-    return visual_hull.carve(
+    return carve(
         *inputs.views, resolution=config.resolution, outliers=config.outliers, names=inputs.names
     )
 

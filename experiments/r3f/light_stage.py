@@ -50,9 +50,10 @@ from refref_jax.reconstruct.families import Revolution
 from refref_jax.reconstruct.interior_looks import SearchSettings
 from refref_jax.reconstruct.interior_search import Finding
 from refref_jax.reconstruct.interiors import Solid, Vessel
-from refref_jax.reconstruct.masks import Outlines, Views, fit_profile
+from refref_jax.reconstruct.masks import Views
 from refref_jax.reconstruct.model_selection import Trial
 from refref_jax.reconstruct.opaque_ends import OpaqueEnd
+from refref_jax.reconstruct.outlines import Outlines, fit_profile
 from refref_jax.reconstruct.photometry import Backdrop, Photographs
 from refref_jax.reconstruct.refinement import objection
 from refref_jax.reconstruct.relief import measure_relief
@@ -271,7 +272,7 @@ def look_at_ends(
     if outer is None:
         return RevolvedObject(None)
     relief = measure_relief(mesh, outer.axis)
-    outer = fit_profile(outer, Outlines(read_views(scene), seed=seed), relief=relief)
+    outer = fit_profile(outer, read_views(scene), relief=relief, seed=seed)
     ends = opaque_ends.find_opaque_ends(outer, surface, seen.fitted, seed=seed)
     return RevolvedObject(outer, ends)
 

@@ -102,6 +102,20 @@ def project(
     return Projection(middle + np.stack([scale * x, -scale * y], axis=-1), -z)
 
 
+def projection_slopes(
+    seen: Projection, pose: Float[np.ndarray, "3 4"], cameras: Cameras
+) -> tuple[Float[np.ndarray, "points 3"], Float[np.ndarray, "points 3"]]:
+    """Returns the derivatives of the column and of the row of projected points by the points."""
+    middle = 0.5 * np.array([cameras.width, cameras.height])
+    x, y = (seen.pixels - middle).T / cameras.focal
+    right, up, back = pose[:, 0], pose[:, 1], pose[:, 2]
+    scale = cameras.focal / seen.depths
+    # A pixel is middle + focal (x, -y) / depth, and depth is along minus the third axis.
+    by_column = scale[:, None] * (right + x[:, None] * back)
+    by_row = scale[:, None] * (-up + y[:, None] * back)
+    return by_column, by_row
+
+
 def supersample(cameras: Cameras, side: int) -> Cameras:
     """Returns the same cameras with every pixel split into `side x side` subpixels.
 

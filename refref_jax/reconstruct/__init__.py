@@ -1,6 +1,6 @@
 """R3F: geometry and refractive index from posed images and masks, without manual steps.
 
-The visual hull of the masks is a scalar field on a grid (`visual_hull`). Its zero level set is a
+The visual hull of the masks is a scalar field on a grid (`masks`). Its zero level set is a
 mesh (`grids`), which is cleaned, smoothed and remeshed (`refinement`). An occupancy field trained
 on the masks (`occupancy`, as in the paper) yields the same kind of grid. `mesh_distance` compares
 the mesh with a ground-truth mesh and with the masks; `refractive_index` estimates the index from

@@ -21,11 +21,13 @@ class Detail(NamedTuple):
 
     Attributes:
       outer: points along the outer wall.
+      ridges: points that are added there if the wall has narrow ridges (`Revolution.knots`).
       inner: points along the inner wall, all of its pieces together.
       azimuths: number of half-planes.
     """
 
     outer: int = 112
+    ridges: int = 128
     inner: int = 124
     azimuths: int = 96
 
@@ -33,7 +35,7 @@ class Detail(NamedTuple):
 FINE = Detail()
 """Enough for photographs of 200 x 200 pixels."""
 
-COARSE = Detail(outer=72, inner=80, azimuths=64)
+COARSE = Detail(outer=72, ridges=0, inner=80, azimuths=64)
 """Enough for a look through a blurred backdrop."""
 
 

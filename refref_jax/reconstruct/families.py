@@ -1,9 +1,8 @@
 """Families of closed surfaces with few unknowns, fitted to noisy meshes (NumPy only).
 
-A mesh from masks is wrong by up to a few percent of a face's length, so its normals are off by
-degrees. If the object is a ball, a cylinder or a vase, the right few numbers describe it without
-noise. `candidates` returns the families that come near a mesh as shapes (`shapes`), whose unknowns
-a solver then fits to images.
+A mesh from masks is wrong by a few percent of a face's length, so its normals are off by degrees.
+If the object is a ball, a cylinder or a vase, the right few numbers describe it without noise.
+`candidates` returns the families near a mesh as shapes (`shapes`), which a solver fits to images.
 
 All fits are equivariant: a mesh that is moved and scaled has the same fit, moved and scaled.
 
@@ -11,6 +10,7 @@ Sources: Pottmann and Randrup (1998) for axes, see `revolution`; the rest is our
 """
 
 import copy
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -34,6 +34,7 @@ from refref_jax.reconstruct.revolution import (
     lathe,
     lengths,
     profile_normals,
+    turn_right,
 )
 from refref_jax.reconstruct.shapes import (
     FURTHEST,
@@ -65,6 +66,9 @@ _ALONG_PROFILE, _AROUND_AXIS = 192, 128
 
 # Knots of the offset along a profile.
 _KNOTS = 36
+
+# Knots of a profile without ridges, their least height as a share of the diameter, and rounds.
+_BASE_KNOTS, _RIDGE, _RIDGE_ROUNDS = 20, 0.0005, 12
 
 # Rounds of robust weights. A torus is not tried if the first guess is further from the mesh than
 # this multiple of what is accepted; its tube is at most this share of the radius of its circle.
@@ -185,26 +189,40 @@ class Revolution:
       name: kind of the shape.
       axis: axis of the fit.
       points: profile of the fit, relative to the point of the axis.
+      base: the same without narrow parts that stand out, such as rings, where knots are many.
       directions: its outward normals.
       closed: whether the profile is closed.
+      size: diameter of the body, world units.
       relief: difference of the surface from one of revolution, if there is any.
+      knots: number of knots of the profile and of its offsets.
     """
 
     name = "surface of revolution"
 
     def __init__(
-        self, axis: Axis, profile: Profile, size: float, relief: Relief | None = None
+        self,
+        axis: Axis,
+        profile: Profile,
+        size: float,
+        relief: Relief | None = None,
+        *,
+        knots: int = _KNOTS,
     ) -> None:
-        """Takes the axis, its profile in even steps, the diameter of the body, and its relief."""
-        self.axis, self.closed, self._size = axis, profile.closed, size
-        self.relief = relief
-        at, length = _places(profile, _ALONG_PROFILE)
-        knots, _ = _places(profile, _KNOTS)
-        self.points = _between_knots(profile, knots)(at)
+        """Takes the axis, its profile in even steps, the diameter, the relief, and the knots."""
+        self.axis, self.closed, self.size = axis, profile.closed, size
+        self.relief, self.knots = relief, knots
+        at, length = _places(profile, max(_ALONG_PROFILE, 3 * knots))
+        places, _ = _places(profile, _KNOTS)
+        self.points = self.base = _between_knots(profile, places)(at)
+        if knots > _KNOTS:
+            places = np.linspace(0.0, length, _BASE_KNOTS)
+            self.base = _between_knots(profile, places, ridges=_RIDGE * size)(at)
+            places = np.linspace(0.0, length, knots)
+            self.points = _between_knots(profile, places)(at)
         self._along = _slope_matrices(at, length, profile.closed)
         along = np.stack([m @ self.points[:, i] for i, m in enumerate(self._along)], axis=-1)
-        self.directions = _turn_right(along) / np.linalg.norm(along, axis=-1, keepdims=True)
-        hats = _even_spline(knots, length, profile.closed)(at)
+        self.directions = turn_right(along) / np.linalg.norm(along, axis=-1, keepdims=True)
+        hats = _even_spline(places, length, profile.closed)(at)
         moved = self.directions[:, :, None] * hats[:, None]
         self._slopes = moved
         number = np.arange(len(at) if profile.closed else len(at) - 1)
@@ -215,7 +233,7 @@ class Revolution:
 
     def start(self) -> Unknowns:
         """Returns zeros: the axis and the profile of the fit."""
-        return np.zeros(4 + _KNOTS)
+        return np.zeros(4 + self.knots)
 
     def profile(self, unknowns: Unknowns) -> Turned:
         """Returns points and normals of the profile, and their derivatives by the offsets."""
@@ -223,7 +241,7 @@ class Revolution:
         along = np.stack([m @ points[:, i] for i, m in enumerate(self._along)], axis=-1)
         moved = np.stack([m @ self._slopes[:, i] for i, m in enumerate(self._along)], axis=1)
         length = np.linalg.norm(along, axis=-1)[:, None]
-        normals, turned = _turn_right(along) / length, _turn_right(moved) / length[..., None]
+        normals, turned = turn_right(along) / length, turn_right(moved) / length[..., None]
         turned = turned - normals[..., None] * np.sum(normals[..., None] * turned, axis=1)[:, None]
         return Turned(points, self._slopes, normals, turned)
 
@@ -238,8 +256,13 @@ class Revolution:
         """Returns the body at given unknowns, at rest."""
         frame = self.axis.frame
         axis = Axis(self.axis.point + frame[:, :2] @ unknowns[2:4], frame @ tilt(unknowns[:2])[0])
-        profile = even_profile(Profile(self.profile(unknowns).points, self.closed), self._size)
-        return Revolution(axis, profile, self._size, self.relief)
+        profile = even_profile(Profile(self.profile(unknowns).points, self.closed), self.size)
+        return Revolution(axis, profile, self.size, self.relief, knots=self.knots)
+
+    def with_knots(self, knots: int) -> "Revolution":
+        """Returns the body with another number of knots."""
+        profile = even_profile(Profile(self.points, self.closed), self.size)
+        return Revolution(self.axis, profile, self.size, self.relief, knots=knots)
 
     def with_relief(self, relief: Relief | None) -> "Revolution":
         """Returns the body with another relief."""
@@ -258,23 +281,22 @@ class Revolution:
           bend: standard deviation of the second difference of three neighbouring offsets, as a
             share of the diameter.
         """
-        bends = np.diff(np.eye(_KNOTS), 2, axis=0)
-        if self.closed:
-            bends = np.roll(np.eye(_KNOTS), 1, axis=0) - 2.0 * np.eye(_KNOTS)
-            bends += np.roll(np.eye(_KNOTS), -1, axis=0)
-        deviations = [_ANGLE, _LENGTH * self._size, _OFFSET * self._size]
-        precision = np.diag(np.repeat(deviations, [2, 2, _KNOTS]) ** -2.0)
-        precision[4:, 4:] += bends.T @ bends / (bend * self._size) ** 2
+        bends = self.bends()
+        deviations = [_ANGLE, _LENGTH * self.size, _OFFSET * self.size]
+        precision = np.diag(np.repeat(deviations, [2, 2, self.knots]) ** -2.0)
+        precision[4:, 4:] += bends.T @ bends / (bend * self.size) ** 2
         return precision, precision @ unknowns
+
+    def bends(self) -> Float[np.ndarray, "bends knots"]:
+        """Returns the second differences of neighbouring offsets, one in each row."""
+        one = np.eye(self.knots)
+        if self.closed:
+            return np.roll(one, 1, axis=0) - 2.0 * one + np.roll(one, -1, axis=0)
+        return np.diff(one, 2, axis=0)
 
     def scales(self) -> Unknowns:
         """Returns 0.02 radians and 0.77 % of the diameter."""
-        return np.repeat([LARGEST_TURN, LARGEST_STEP * self._size], [2, 2 + _KNOTS])
-
-
-def _turn_right(along: np.ndarray) -> np.ndarray:
-    """Returns directions of the half-plane turned by a right angle, outwards from a profile."""
-    return np.stack([along[:, 1], -along[:, 0]], axis=1)
+        return np.repeat([LARGEST_TURN, LARGEST_STEP * self.size], [2, 2 + self.knots])
 
 
 def _places(profile: Profile, count: int) -> tuple[Float[np.ndarray, " count"], float]:
@@ -297,12 +319,15 @@ def _places(profile: Profile, count: int) -> tuple[Float[np.ndarray, " count"], 
     return at[:count], float(length[-1])
 
 
-def _between_knots(profile: Profile, knots: Float[np.ndarray, " knots"]) -> Callable[..., Curve]:
+def _between_knots(
+    profile: Profile, knots: Float[np.ndarray, " knots"], *, ridges: float = math.inf
+) -> Callable[..., Curve]:
     """Returns the spline of given knots nearest to a profile: radii odd about the poles.
 
-    Shorter waves are noise, which no offset at the knots could remove.
+    Shorter waves are noise, which no offset at the knots could remove. Points that are higher above
+    the spline than `ridges`, in world units, lose their weight.
     """
-    points = profile.curve
+    points, normals = profile.curve, profile_normals(profile)
     length = lengths(points)
     one = np.eye(len(knots))
     if profile.closed:
@@ -311,10 +336,15 @@ def _between_knots(profile: Profile, knots: Float[np.ndarray, " knots"]) -> Call
         # The radius is zero at both poles.
         radii = CubicSpline(knots, one[:, 1:-1], bc_type="natural")
         cubics = [radii, CubicSpline(knots, one, bc_type="clamped")]
-    values = [
-        np.linalg.lstsq(cubic(length), points[:, i], rcond=None)[0]
-        for i, cubic in enumerate(cubics)
-    ]
+    weights, matrices = np.ones((len(points), 1)), [cubic(length) for cubic in cubics]
+    for _ in range(1 if math.isinf(ridges) else _RIDGE_ROUNDS):
+        values = [
+            np.linalg.lstsq(weights * matrix, weights[:, 0] * points[:, i], rcond=None)[0]
+            for i, matrix in enumerate(matrices)
+        ]
+        near = np.stack([m @ v for m, v in zip(matrices, values, strict=True)], axis=-1)
+        above = np.sum((points - near)[: len(normals)] * normals, axis=-1) / ridges
+        weights[: len(above), 0] = 1.0 / np.hypot(1.0, np.maximum(above, 0.0))
     return lambda s: np.stack([c(s) @ v for c, v in zip(cubics, values, strict=True)], axis=-1)
 
 

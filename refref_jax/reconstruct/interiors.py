@@ -147,12 +147,14 @@ class Vessel:
         self.outer, self.interior_at_start, self.detail = outer, interior, detail
         profile = walls.with_punt(Profile(outer.points, closed=False), interior.punt)
         self.size = _size(outer.points)
-        self._outer = Wall(profile, points=detail.outer, knots=_KNOTS)
+        points = detail.outer + (detail.ridges if outer.knots > _KNOTS else 0)
+        self._outer = Wall(profile, points=points, knots=_KNOTS)
         self._looseness = self._find_looseness()
         self.layout = Layout(interior, _KNOTS, _INNER_KNOTS)
         if interior.contents != "none":
             ends = {"base": interior.base, "lid": interior.lid}
-            space = walls.inset(profile, interior.wall, self.size, **ends)
+            base = walls.with_punt(Profile(outer.base, closed=False), interior.punt)
+            space = walls.inset(base, interior.wall, self.size, **ends)
             if space is None:
                 raise ReconstructionError(
                     f"A wall of {interior.wall:g}, a base of {interior.base:g} and a lid of "

@@ -1,4 +1,4 @@
-"""Masks as signed distances in the image, with subpixel accuracy, and their outlines (NumPy only).
+"""Masks as signed distances in the image, and the hull that they carve (NumPy only).
 
 A mask states for each pixel centre whether the object is visible there, so the outline is known to
 half a pixel, as a staircase. Averaging the signed distances to its steps over a neighbourhood is
@@ -10,40 +10,65 @@ Errors measured on discs with a radius of 34 pixels and on squares at all angles
 alone 0.23 RMS; blur 1.5: 0.14 RMS, mean below 0.01, corners cut back by 0.5; blur 3: 0.10, 0.01 and
 1.0.
 
-`Outlines` are equations of the masks' outlines, for `gauss_newton`. Where the surface turns away
-from a camera, its image has an edge, and the edge of the mask should be there. A point of this rim
-that moves by `dx` moves its image across the edge by
-`d (signed distance) / d pixel . d pixel / d point . dx`; moving along the line of sight changes
-nothing. Masks are sampled at the centres of pixels, so the distance of a point has an error of
-about a third of a pixel. Masks that are wrong, or show something else, lose their weight.
+`carve` returns the visual hull, the largest object that fits a set of masks. Each view carves away
+the points that project outside of its mask. The hull's field at a point is the maximum over views
+of the signed distance to the outline, in pixels, times planar depth over focal length: the zero set
+of that maximum is the exact hull, and near it the field is a distance in world units.
 
-`fit_profile` fits a body of revolution to outlines alone. A mesh from masks is up to half a pixel
-too narrow and has waves along its profile; the outlines of all views together determine it to some
-hundredths of a pixel, and its normals to half a degree.
+The hull of finitely many views encloses the object: a ball becomes tangent cones. Cavities, and
+dents that no line of sight grazes, are invisible in outlines and remain filled.
 
-Source: Cipolla and Blake, Surface Shape from the Deformation of Apparent Contours (1992), for the
-derivative; its use beside refraction is ours.
+Outlines are known to a fraction of a pixel, and at every point the view with the largest inward
+error decides. The hull would therefore lie inside the true one: by the error of one outline where
+the surface is smooth, and by twice that at an edge, which is on the outline of many views. A
+tolerance in pixels compensates for this.
+
+Source: Laurentini, The Visual Hull Concept for Silhouette-Based Image Understanding (1994).
 """
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import scipy.sparse
 from jaxtyping import Bool, Float, Int
-from scipy.ndimage import distance_transform_edt, gaussian_filter, gaussian_laplace
+from scipy.ndimage import (
+    distance_transform_edt,
+    gaussian_filter,
+    gaussian_laplace,
+    map_coordinates,
+)
 
 from refref_jax.geometry.cameras import Cameras, project
-from refref_jax.geometry.triangle_meshes import unit_vectors
 from refref_jax.reconstruct import ReconstructionError
-from refref_jax.reconstruct.families import Revolution
-from refref_jax.reconstruct.gauss_newton import Candidate, Rows
-from refref_jax.reconstruct.relief import Relief
-from refref_jax.reconstruct.shapes import Posed
+from refref_jax.reconstruct.grids import Box, Field, Grid, Points, Values, lattice, sample
 
 BLUR = 1.5
 """Standard deviation of the average over an outline, pixels."""
+
+REACH = 2.1
+"""Half the edge of the cube around the origin that is searched for the object, world units."""
+
+TOLERANCE = 0.05
+"""Pixels outside of an outline up to which nothing is carved: about half a standard error."""
+
+LEAST_RESOLUTION = 10
+"""Smallest number of cells of a grid, including its rim."""
+
+_LIMITLESS = (
+    "The hull of {count} masks extends outside the cube from -{reach} to {reach} around the "
+    "origin, which is searched for the object. Add masks from other directions if there are "
+    "few; otherwise scale and shift the poses, so that the object lies inside."
+)
+
+# Distance used where there is no outline, so that a grid can be interpolated.
+_FAR = 4.0 * REACH
+
+# Cells along the cube's edge in the search for a box, and cells added around this box.
+_SEARCH = 48
+_MARGIN = 1.0
+
+# Cells added around the final box, so that the surface stays inside.
+_RIM = 3
 
 
 class Views(NamedTuple):
@@ -142,246 +167,7 @@ def signed_distances(
     return smooth - 0.5 * blur**2 * gaussian_laplace(steps, blur, mode="nearest")
 
 
-def _listed(views: Int[np.ndarray, " views"]) -> str:
-    """Returns the numbers of the first few views, as text."""
-    names = ", ".join(str(view) for view in views[:5])
-    return f"Views {names}{', ...' if len(views) > 5 else ''}: {len(views)}"
-
-
-OUTLINE_DEVIATION = 0.3
-"""Standard deviation of a signed distance, the unit of the errors of outlines, in pixels."""
-
-# Distance at which a point has lost half of its weight, in pixels; points that are further away are
-# of an inner edge, which a mask does not show.
-_WRONG, _FURTHEST = 1.0, 3.0
-
-# Largest number of rim points per view: neighbours have the same error, so more add nothing.
-_POINTS = 100
-
-# Steps of the fit of a profile, and the standard deviation of the second differences of its knots,
-# as a share of the diameter: neighbouring points have errors that are alike.
-_ROUNDS, _BEND = 5, 0.001
-
-# Cosine of the angle between normals at a crease, and points along it.
-_CREASE, _ALONG_CREASE = math.cos(math.radians(10.0)), 12
-
-# Largest error of a body with a relief, as a share of that of the body without it.
-_BETTER = 0.95
-
-
-class _Rim(NamedTuple):
-    """Points between two vertices, where the surface turns away from a camera.
-
-    Attributes:
-      first: vertex at one end.
-      second: vertex at the other end.
-      share: share of the second vertex.
-    """
-
-    first: Int[np.ndarray, " points"]
-    second: Int[np.ndarray, " points"]
-    share: Float[np.ndarray, " points"]
-
-
-class _Creases(NamedTuple):
-    """Edges across which the shading normals jump.
-
-    Attributes:
-      edges: their vertices.
-      faces: the faces on both sides.
-    """
-
-    edges: Int[np.ndarray, "creases 2"]
-    faces: Int[np.ndarray, "creases 2"]
-
-
-class Outlines:
-    """The outlines of masks, as a function of a candidate to `Rows`."""
-
-    def __init__(
-        self,
-        views: Views,
-        *,
-        common: float = 0.0,
-        seed: int = 0,
-        reach: float = _FURTHEST,
-        creased: bool = False,
-    ) -> None:
-        """Measures the signed distances of all masks.
-
-        Args:
-          views: masks and their cameras.
-          common: standard deviation, in pixels, of how much too wide all masks are.
-          seed: seed of the draws of rim points.
-          reach: distance from an outline beyond which points have no say, pixels.
-          creased: whether surfaces turn away at creases, too, as meshes that are given may.
-        """
-        self._cameras, self._common, self._seed = views.cameras, common, seed
-        self._reach, self._creased = reach, creased
-        self._distances = [
-            signed_distances(mask).astype(np.float32) if mask.any() and not mask.all() else None
-            for mask in views.masks
-        ]
-
-    def __call__(self, candidate: Candidate) -> Rows:
-        """Returns the equations of the outline of the first part, which contains all others."""
-        return self.of_surface(candidate.parts[0])
-
-    def of_surface(self, part: Posed) -> Rows:
-        """Returns the equations of the outline of a surface."""
-        normals = _vertex_normals(part)
-        edges, creases = _edges(part.faces), _creases(part) if self._creased else None
-        if creases is not None:  # the mean of normals on both sides of a crease says nothing
-            edges = edges[~np.any(np.isin(edges, creases.edges), axis=1)]
-        generator = np.random.default_rng(self._seed)
-        found = [
-            self._of_view(view, distances, part, normals, edges, creases, generator)
-            for view, distances in enumerate(self._distances)
-            if distances is not None
-        ]
-        errors = np.concatenate([each[0] for each in found])
-        derivatives = scipy.sparse.vstack([each[1] for each in found]).tocsr()
-        wrong = _WRONG * self._reach / _FURTHEST
-        weights = 1.0 / (1.0 + (errors * OUTLINE_DEVIATION / wrong) ** 2) ** 2
-        return Rows(
-            errors, derivatives @ part.by_vertices, weights, self._common / OUTLINE_DEVIATION
-        )
-
-    def of_surfaces(self, parts: Sequence[Posed]) -> Rows:
-        """Returns the equations of the outlines of surfaces that depend on the same unknowns."""
-        each = [self.of_surface(part) for part in parts]
-        return Rows(
-            np.concatenate([rows.errors for rows in each]),
-            np.concatenate([rows.derivatives for rows in each]),
-            np.concatenate([rows.weights for rows in each]),
-            each[0].common,
-        )
-
-    def _of_view(
-        self,
-        view: int,
-        distances: Float[np.ndarray, "h w"],
-        part: Posed,
-        normals: Float[np.ndarray, "vertices 3"],
-        edges: Int[np.ndarray, "edges 2"],
-        creases: "_Creases | None",
-        generator: np.random.Generator,
-    ) -> tuple[Float[np.ndarray, " points"], scipy.sparse.csr_array]:
-        """Returns errors and derivatives by the vertices of the rim of one view."""
-        pose, columns = self._cameras.poses[view], 3 * len(part.vertices)
-        rim = _rim(part.vertices, normals, edges, pose[:, 3])
-        if creases is not None:
-            along = _crease_rim(part, creases, pose[:, 3])
-            rim = _Rim(*(np.concatenate(both) for both in zip(rim, along, strict=True)))
-        share = rim.share[:, None]
-        points = (1.0 - share) * part.vertices[rim.first] + share * part.vertices[rim.second]
-        seen = project(points, pose, self._cameras)
-        distance, slope = _sample(distances, seen.pixels)
-        size = np.array([self._cameras.width, self._cameras.height])
-        visible = (seen.depths > 0.0) & np.all((seen.pixels > 0) & (seen.pixels < size), axis=-1)
-        near = np.flatnonzero((np.abs(distance) < self._reach) & visible)
-        near = generator.permutation(near)[:_POINTS]
-        rows = _by_points(slope[near], seen.pixels[near], seen.depths[near], pose, self._cameras)
-        first, second = rim.first[near], rim.second[near]
-        blocks = np.concatenate([(1.0 - share[near]) * rows, share[near] * rows], axis=1)
-        at = 3 * np.stack([first, second], axis=1)[..., None] + np.arange(3)
-        row = np.repeat(np.arange(len(near)), 6)
-        entries = (blocks.ravel() / OUTLINE_DEVIATION, (row, at.ravel()))
-        matrix = scipy.sparse.coo_array(entries, shape=(len(near), columns)).tocsr()
-        return distance[near] / OUTLINE_DEVIATION, matrix
-
-
-def fit_profile(
-    outer: Revolution, outlines: Outlines, *, relief: Relief | None = None
-) -> Revolution:
-    """Fits a body of revolution to outlines alone.
-
-    Args:
-      outer: a body near the outlines, such as that of a mesh from masks.
-      outlines: the outlines.
-      relief: possible difference from a body of revolution. The body gets it only if the
-        outlines are explained better by it: meshes from masks have such a relief in hollows, too.
-    """
-    found = _fitted(outer.with_relief(None), outlines)
-    if relief is None:
-        return found
-    raised = _fitted(found.with_relief(relief), outlines)
-    better = _error(raised, outlines) < _BETTER * _error(found, outlines)
-    return raised if better else found
-
-
-def _fitted(outer: Revolution, outlines: Outlines) -> Revolution:
-    x = outer.start()
-    for _ in range(_ROUNDS):
-        rows = outlines.of_surface(outer.pose(x))
-        weighted = rows.weights[:, None] * rows.derivatives
-        precision, gradient = outer.prior(x, bend=_BEND)
-        matrix = weighted.T @ rows.derivatives + precision
-        x = x - np.linalg.solve(matrix, weighted.T @ rows.errors + gradient)
-    return outer.moved(x)
-
-
-def _error(outer: Revolution, outlines: Outlines) -> float:
-    """Returns the mean distance from the outlines, in standard deviations, up to the largest."""
-    errors = outlines.of_surface(outer.pose(outer.start())).errors
-    return float(np.mean(np.minimum(np.abs(errors), _WRONG / OUTLINE_DEVIATION)))
-
-
-def _vertex_normals(part: Posed) -> Float[np.ndarray, "vertices 3"]:
-    """Returns the mean of the corner normals at each vertex."""
-    at, each = part.faces.ravel(), part.normals[part.normal_ids.ravel()]
-    sums = [np.bincount(at, each[:, axis], len(part.vertices)) for axis in range(3)]
-    return unit_vectors(np.stack(sums, axis=-1))
-
-
-def _edges(faces: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, "edges 2"]:
-    """Returns each edge of a closed mesh once."""
-    both = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    return both[both[:, 0] < both[:, 1]]
-
-
-def _creases(part: Posed) -> _Creases:
-    """Returns the edges of a closed mesh whose normals differ by more than 10 degrees."""
-    around = [0, 1, 1, 2, 2, 0]
-    both, ids = (x[:, around].reshape(-1, 2) for x in (part.faces, part.normal_ids))
-    turned = both[:, 0] > both[:, 1]
-    both[turned], ids[turned] = both[turned, ::-1], ids[turned, ::-1]
-    order = np.lexsort(both.T)
-    first, second = order[::2], order[1::2]
-    if not np.array_equal(both[first], both[second]):
-        raise ReconstructionError("A mesh is not closed, so its outlines are unknown. Close it.")
-    cosines = np.sum(part.normals[ids[first]] * part.normals[ids[second]], axis=-1)
-    sharp = np.any(cosines < _CREASE, axis=1)
-    return _Creases(both[first][sharp], np.stack([first, second], axis=-1)[sharp] // 3)
-
-
-def _crease_rim(part: Posed, creases: _Creases, camera: Float[np.ndarray, "3"]) -> _Rim:
-    """Returns points of the creases with one face towards the camera and one away from it."""
-    corners = part.vertices[part.faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    front = np.sum(normals * (camera - corners[:, 0]), axis=-1) > 0.0
-    seen = creases.edges[front[creases.faces[:, 0]] != front[creases.faces[:, 1]]]
-    # The ends are left out, where the smoothed distances of a mask cut corners.
-    share = (np.arange(_ALONG_CREASE) + 1.5) / (_ALONG_CREASE + 2.0)
-    repeated = np.repeat(seen, _ALONG_CREASE, axis=0)
-    return _Rim(repeated[:, 0], repeated[:, 1], np.tile(share, len(seen)))
-
-
-def _rim(
-    vertices: Float[np.ndarray, "vertices 3"],
-    normals: Float[np.ndarray, "vertices 3"],
-    edges: Int[np.ndarray, "edges 2"],
-    camera: Float[np.ndarray, "3"],
-) -> _Rim:
-    """Returns where the interpolated normals are perpendicular to the lines of sight."""
-    facing = np.sum(normals * (camera - vertices), axis=-1)
-    first, second = facing[edges[:, 0]], facing[edges[:, 1]]
-    turns = np.flatnonzero((first > 0.0) != (second > 0.0))
-    share = first[turns] / (first[turns] - second[turns])
-    return _Rim(edges[turns, 0], edges[turns, 1], share)
-
-
-def _sample(
+def sample_with_slope(
     image: Float[np.ndarray, "h w"], pixels: Float[np.ndarray, "points 2"]
 ) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, "points 2"]]:
     """Returns an image, whose values are at the centres of pixels, and its slope at points."""
@@ -397,19 +183,184 @@ def _sample(
     return value, np.stack([along, across], axis=-1)
 
 
-def _by_points(
-    slope: Float[np.ndarray, "points 2"],
-    pixels: Float[np.ndarray, "points 2"],
-    depths: Float[np.ndarray, " points"],
+def _listed(views: Int[np.ndarray, " views"]) -> str:
+    """Returns the numbers of the first few views, as text."""
+    names = ", ".join(str(view) for view in views[:5])
+    return f"Views {names}{', ...' if len(views) > 5 else ''}: {len(views)}"
+
+
+def carve(
+    masks: Bool[np.ndarray, "views h w"],
+    cameras: Cameras,
+    *,
+    resolution: int = 128,
+    box: Box | None = None,
+    outliers: int = 0,
+    tolerance: float = TOLERANCE,
+    blur: float = BLUR,
+    names: Sequence[str] | None = None,
+) -> Grid:
+    """Returns the field of the masks' hull on a grid.
+
+    A view does not carve points outside of its image or behind its camera. A point that at most
+    `outliers` views see is empty.
+
+    Up to `outliers` views may be wrong: at each point the `outliers` largest values are ignored, so
+    that a mask that misses part of the object, or is shifted, does no harm. This costs accuracy
+    everywhere: what only `outliers` views or fewer would carve remains, so the object grows between
+    tangent cones. If more masks have the same error, it is not detected.
+
+    Args:
+      masks: one mask per view, true where the object is visible.
+      cameras: cameras of the masks, in the same order.
+      resolution: cells along the longest edge of the box, at least `LEAST_RESOLUTION`.
+      box: bounding box of the object; derived from the masks within `REACH` of the origin if
+        `None`.
+      outliers: number of largest values ignored at each point.
+      tolerance: pixels outside of an outline up to which nothing is carved, see the module.
+      blur: blur of the outlines in pixels, see `masks`.
+      names: names of the masks in errors; their numbers if `None`.
+
+    Raises:
+      ReconstructionError: if there is no mask, if a mask is empty, of another size or not boolean,
+        if a pose is not finite, if there are at least as many outliers as views, if the grid is too
+        coarse, if nothing is left, or if the hull extends outside the cube of `REACH` (as with one
+        view).
+    """
+    check_masks(masks, cameras)
+    if not 0 <= outliers < len(masks):
+        raise ReconstructionError(
+            f"outliers={outliers}, but there are {len(masks)} views. Pass a smaller number."
+        )
+    if resolution < LEAST_RESOLUTION:
+        raise ReconstructionError(
+            f"resolution={resolution} is too coarse. Pass {LEAST_RESOLUTION} cells or more."
+        )
+    field = hull_field(masks, cameras, outliers=outliers, tolerance=tolerance, blur=blur)
+    if box is None:
+        box = find_box(field, masks, cameras, names=names)
+    spacing = float(np.max(box.high - box.low)) / (resolution - 2 * _RIM)
+    wide = Box(box.low - _RIM * spacing, box.high + _RIM * spacing)
+    grid = sample(field, wide, spacing=spacing)
+    if not np.any(grid.values < 0.0):
+        raise ReconstructionError(_explanation(masks, cameras, box, names))
+    return grid
+
+
+def hull_field(
+    masks: Bool[np.ndarray, "views h w"],
+    cameras: Cameras,
+    *,
+    outliers: int = 0,
+    tolerance: float = TOLERANCE,
+    blur: float = BLUR,
+) -> Field:
+    """Returns the field of the masks' hull as a function of points, see `carve`."""
+    images = [signed_distances(mask, blur=blur) - tolerance for mask in masks]
+
+    def field(points: Points) -> Values:
+        # The largest values so far, in descending order.
+        largest = np.full((outliers + 1, len(points)), -np.inf)
+        for image, pose in zip(images, cameras.poses, strict=True):
+            value = view_values(image, pose, cameras, points)
+            for rank in range(outliers + 1):
+                value, largest[rank] = (
+                    np.minimum(largest[rank], value),
+                    np.maximum(largest[rank], value),
+                )
+        unseen = np.isneginf(largest[-1])
+        return np.where(unseen, _FAR, np.minimum(largest[-1], _FAR))
+
+    return field
+
+
+def find_box(
+    field: Field,
+    masks: Bool[np.ndarray, "views h w"],
+    cameras: Cameras,
+    *,
+    names: Sequence[str] | None = None,
+) -> Box:
+    """Returns a bounding box of the object, which must lie within the cube of `REACH`.
+
+    Args:
+      field: field of the hull, from `hull_field`.
+      masks: masks of the hull.
+      cameras: cameras of the masks.
+      names: names of the masks in errors; their numbers if `None`.
+
+    Raises:
+      ReconstructionError: if nothing is left, or the object extends outside the cube.
+    """
+    ends = np.full(3, REACH)
+    grid = sample(field, Box(-ends, ends), spacing=2.0 * REACH / _SEARCH)
+    # Within half a cell's diagonal of the surface, so that thin objects are not missed.
+    inside = np.argwhere(grid.values < 0.87 * grid.spacing)
+    if len(inside) == 0:
+        raise ReconstructionError(_explanation(masks, cameras, Box(-ends, ends), names))
+    if _reaches_border(grid):
+        raise ReconstructionError(_LIMITLESS.format(count=len(masks), reach=REACH))
+    low = grid.low + grid.spacing * (inside.min(axis=0) - _MARGIN)
+    high = grid.low + grid.spacing * (inside.max(axis=0) + _MARGIN)
+    return Box(np.maximum(low, -ends), np.minimum(high, ends))
+
+
+def view_values(
+    image: Float[np.ndarray, "h w"],
     pose: Float[np.ndarray, "3 4"],
     cameras: Cameras,
-) -> Float[np.ndarray, "points 3"]:
-    """Returns the derivatives of the signed distance by a point in world units."""
-    middle = 0.5 * np.array([cameras.width, cameras.height])
-    x, y = (pixels - middle).T / cameras.focal
-    right, up, back = pose[:, 0], pose[:, 1], pose[:, 2]
-    scale = cameras.focal / depths
-    # A pixel is middle + focal (x, -y) / depth, and depth is along minus the third axis.
-    by_column = scale[:, None] * (right + x[:, None] * back)
-    by_row = scale[:, None] * (-up + y[:, None] * back)
-    return slope[:, :1] * by_column + slope[:, 1:] * by_row
+    points: Points,
+) -> Values:
+    """Returns a view's signed distances in world units, `-inf` outside of its image."""
+    (column, row), depth = (part.T for part in project(points, pose, cameras))
+    seen = (depth > 0.0) & (column >= 0) & (column <= cameras.width)
+    seen &= (row >= 0) & (row <= cameras.height)
+    values = np.full(len(points), -np.inf)
+    if np.all(np.isneginf(image)):
+        values[seen] = -_FAR
+    else:
+        at = np.stack([row[seen], column[seen]]) - 0.5
+        pixels = map_coordinates(image, at, order=1, mode="nearest")
+        values[seen] = pixels * depth[seen] / cameras.focal
+    return values
+
+
+def values_by_view(
+    masks: Bool[np.ndarray, "views h w"], cameras: Cameras, points: Points
+) -> Float[np.ndarray, "views points"]:
+    """Returns `view_values` of all views, for outlines without blur."""
+    views = zip(masks, cameras.poses, strict=True)
+    return np.stack(
+        [
+            view_values(signed_distances(mask, blur=0.0), pose, cameras, points)
+            for mask, pose in views
+        ]
+    )
+
+
+def _reaches_border(grid: Grid) -> bool:
+    """Returns whether an object extends to the border of its grid."""
+    return any(
+        bool(np.any(np.take(grid.values, end, axis=axis) < 0.0))
+        for axis in range(3)
+        for end in (0, -1)
+    )
+
+
+def _explanation(
+    masks: Bool[np.ndarray, "views h w"],
+    cameras: Cameras,
+    box: Box,
+    names: Sequence[str] | None,
+) -> str:
+    """Returns an error message that names the view that carves most of the other views' hull."""
+    carved = values_by_view(masks, cameras, lattice(box, 24)) > 0.0
+    alone = carved & (carved.sum(axis=0) == 1)
+    view = int(np.argmax(alone.sum(axis=1) + carved.mean(axis=1)))
+    name = f"View {view}" if names is None else names[view]
+    return (
+        f"Nothing is left after carving with {len(masks)} masks between {np.round(box.low, 2)} and "
+        f"{np.round(box.high, 2)}. {name} removed the most: {carved[view].mean():.0%} of the box, "
+        f"and {int(alone[view].sum())} of {carved.shape[1]} points that no other view did. Check "
+        "its mask and its pose, pass more outliers, or use a finer resolution."
+    )

@@ -42,8 +42,14 @@ from refref_jax.geometry.triangle_meshes import (
 )
 from refref_jax.reconstruct import ReconstructionError
 from refref_jax.reconstruct.grids import Box, Field, Points, Values, lattice
-from refref_jax.reconstruct.masks import Views, check_masks, overlaps, views_at
-from refref_jax.reconstruct.visual_hull import REACH, values_by_view
+from refref_jax.reconstruct.masks import (
+    REACH,
+    Views,
+    check_masks,
+    overlaps,
+    values_by_view,
+    views_at,
+)
 from refref_jax.render.images import find_first_surface
 
 # Triangles in the first query, and the factor by which each further query grows.
@@ -306,7 +312,7 @@ def carved_alone(views: Views) -> Values:
     """Returns, for each view, the share of the other views' hull that only this view carves away.
 
     The share is measured on a lattice of 64 points along each edge of the cube that is searched for
-    the object, see `visual_hull.REACH`. It is 0 if the hull of the other views contains none of
+    the object, see `masks.REACH`. It is 0 if the hull of the other views contains none of
     them.
 
     Raises:

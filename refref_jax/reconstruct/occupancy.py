@@ -1,6 +1,6 @@
 """Trains an occupancy field on masks and extracts its surface.
 
-This is the paper's method (UNISURF on masks); `visual_hull` solves the same problem exactly and
+This is the paper's method (UNISURF on masks); `masks.carve` solves the same problem exactly and
 faster. The two differ between tangent cones: the visual hull bulges there, whereas here the
 smoothness of the normals decides, so that round objects become rounder and flat faces less flat.
 Wrong masks harm both: a ray that a mask marks as empty carves the object along its full length.
@@ -41,7 +41,7 @@ from refref_jax.geometry.cameras import Cameras, image_rays
 from refref_jax.numerics import host_array
 from refref_jax.reconstruct import ReconstructionError, occupancy_field
 from refref_jax.reconstruct.grids import Box, Grid, Points
-from refref_jax.reconstruct.masks import check_masks, signed_distances
+from refref_jax.reconstruct.masks import check_masks, find_box, hull_field, signed_distances
 from refref_jax.reconstruct.occupancy_field import (
     Chord,
     OccupancyFieldConfig,
@@ -51,7 +51,6 @@ from refref_jax.reconstruct.occupancy_field import (
     logit_along,
     scan,
 )
-from refref_jax.reconstruct.visual_hull import find_box, hull_field
 
 
 @dataclasses.dataclass(frozen=True)
@@ -354,7 +353,7 @@ def fit(
     if not np.any(values < 0.0):
         raise ReconstructionError(
             f"The field is empty after {config.steps} steps on {len(masks)} masks. Check masks and "
-            "poses with visual_hull.carve, which names the view that removes the most, or train "
+            "poses with masks.carve, which names the view that removes the most, or train "
             "with more steps and a lower rate."
         )
     return Grid(values.reshape(cells + 1), low, spacing)
@@ -368,7 +367,7 @@ def search_box(masks: Bool[np.ndarray, "views h w"], cameras: Cameras) -> Box:
       cameras: cameras of the masks, in the same order.
 
     Raises:
-      ReconstructionError: if nothing is left within `visual_hull.REACH`.
+      ReconstructionError: if nothing is left within `masks.REACH`.
     """
     doubted = int(_DOUBTED * len(masks))
     return find_box(hull_field(masks, cameras, outliers=doubted), masks, cameras)

@@ -213,7 +213,7 @@ def clear_part(outer: Revolution, ends: Sequence[OpaqueEnd]) -> Revolution:
         kept = np.concatenate([[[0.0, low]], rim, kept[first:]])
     profile = Profile(even(kept, _PROFILE_POINTS), closed=False)
     size = float(max(2.0 * kept[:, 0].max(), np.ptp(kept[:, 1])))
-    return Revolution(outer.axis, profile, size, outer.relief)
+    return Revolution(outer.axis, profile, size, outer.relief, knots=outer.knots)
 
 
 def _limits(outer: Revolution, ends: Sequence[OpaqueEnd]) -> tuple[float, float]:

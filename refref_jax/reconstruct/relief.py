@@ -69,8 +69,7 @@ class Relief:
 
     def stretch(self, points: Float[np.ndarray, "points 3"]) -> Stretched:
         """Stretches points in the frame of the axis, and returns the derivatives."""
-        height = np.clip(points[:, 2], self.low, self._high)
-        azimuth = np.arctan2(points[:, 1], points[:, 0]) % (2.0 * np.pi)
+        height, azimuth = self._place(points)
         factor = 1.0 + self._spline.ev(height, azimuth)
         by_height = self._spline.ev(height, azimuth, dx=1) * (height == points[:, 2])
         by_azimuth = self._spline.ev(height, azimuth, dy=1)
@@ -81,6 +80,16 @@ class Relief:
         jacobian = flat[:, :, None] * slope[:, None, :]
         jacobian += factor[:, None, None] * np.diag([1.0, 1.0, 0.0]) + np.diag([0.0, 0.0, 1.0])
         return Stretched(factor[:, None] * flat + points * [0.0, 0.0, 1.0], jacobian)
+
+    def shrink(self, points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points 3"]:
+        """Inverts `stretch`."""
+        factor = 1.0 + self._spline.ev(*self._place(points))
+        return points / np.stack([factor, factor, np.ones_like(factor)], axis=-1)
+
+    def _place(self, points: Float[np.ndarray, "points 3"]) -> tuple[np.ndarray, np.ndarray]:
+        """Returns heights, within those of the relief, and azimuths."""
+        height = np.clip(points[:, 2], self.low, self._high)
+        return height, np.arctan2(points[:, 1], points[:, 0]) % (2.0 * np.pi)
 
 
 def measure_relief(mesh: Mesh, axis: Axis) -> Relief | None:

@@ -394,11 +394,16 @@ def _smooth(profile: Profile, deviation: float, size: float) -> Profile:
     return Profile(points, steps.closed)
 
 
+def turn_right(along: np.ndarray) -> np.ndarray:
+    """Returns directions of the half-plane turned by a right angle, outwards from a profile."""
+    return np.stack([along[:, 1], -along[:, 0]], axis=1)
+
+
 def profile_normals(profile: Profile) -> Curve:
     """Returns the outward unit normals of a profile by central differences."""
     loop = _loop(profile.points, profile.closed)
     along = (np.roll(loop, -1, axis=0) - np.roll(loop, 1, axis=0))[: len(profile.points)]
-    normals = np.stack([along[:, 1], -along[:, 0]], axis=-1)
+    normals = turn_right(along)
     return normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-300)
 
 

@@ -27,6 +27,7 @@ from refref_jax.reconstruct.revolution import (
     lengths,
     outline,
     profile_normals,
+    turn_right,
 )
 
 # Points of a profile while it is prepared, and cells along the diameter while it is inset.
@@ -113,7 +114,7 @@ class Wall:
         along = np.stack(
             [self._radii(self.at, 1) @ points[:, 0], self._heights(self.at, 1) @ points[:, 1]], -1
         )
-        return _turn_right(along) / np.linalg.norm(along, axis=-1, keepdims=True)
+        return turn_right(along) / np.linalg.norm(along, axis=-1, keepdims=True)
 
     def curve(
         self,
@@ -155,7 +156,7 @@ class Wall:
         by_points = values[1] + along[:, :, None] * by_at[:, None]
         by_along = first[1] + bend[:, :, None] * by_at[:, None]
         size = np.linalg.norm(along, axis=-1)[:, None]
-        normals, turned = _turn_right(along) / size, _turn_right(by_along) / size[..., None]
+        normals, turned = turn_right(along) / size, turn_right(by_along) / size[..., None]
         away = np.sum(normals[..., None] * turned, axis=1)[:, None]
         return Turned(points, by_points, normals, turned - normals[..., None] * away)
 
@@ -416,11 +417,6 @@ def with_punt(profile: Profile, height: float) -> Profile:
     share = np.minimum(points[: last + 1, 0] / reach, 1.0)
     points[: last + 1, 1] += height * (1.0 - share**2)
     return Profile(points, profile.closed)
-
-
-def _turn_right(along: np.ndarray) -> np.ndarray:
-    """Returns directions of the half-plane turned by a right angle, outwards from a profile."""
-    return np.stack([along[:, 1], -along[:, 0]], axis=1)
 
 
 def _below(

@@ -4,6 +4,7 @@
 of a model with a field in front of it, whose steps `fit` takes afterwards.
 """
 
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -29,6 +30,9 @@ from refref_jax.training.backdrop_equations import Block, Gains
 from refref_jax.training.config import TrainConfig, require
 from refref_jax.training.loop import TrainState
 from refref_jax.training.run_folder import Checkpoints
+
+# The solver stops where the next round is expected to gain less than this, dB.
+_WORTH = 0.05
 
 # Number of values that determine the mean colour of the images.
 _MOST_MEAN = 10_000_000
@@ -137,7 +141,10 @@ class _Problem(NamedTuple):
         return self.model.config.field_parts
 
     def iterate(self, run: Path, state: TrainState) -> Iterator[backdrop_solver.Progress]:
-        """Yields the progress of the solver from a state on; at first, the coverage is written."""
+        """Yields the progress of the solver from a state on; at first, the coverage is written.
+
+        Where all pixels are in memory, it stops when another round would gain hardly anything.
+        """
         step, streams = int(state.step), self.share < 1.0
         with ThreadPoolExecutor(1) as beside:
             compiled = beside.submit(
@@ -151,7 +158,8 @@ class _Problem(NamedTuple):
         def drawn(number: int) -> Sequence[Block]:
             return first.pop() if first else self.equations(number)
 
-        return backdrop_solver.solve(
+        rounds = _reached(run, step)
+        for reached in backdrop_solver.solve(
             drawn if streams else first.pop(),
             iterations=require(self.config.model.iterations),
             start=(step, surface_of(state.params)) if step else None,
@@ -161,7 +169,30 @@ class _Problem(NamedTuple):
             held=_solver_of(state).held,
             uniform=self._uniform() if streams else None,
             tint_decay=self.config.losses.tint_decay,
-        )
+        ):
+            yield reached
+            if reached.step % backdrop_solver.ROUND == 0:
+                rounds.append(reached.held_out)
+                if not streams and _expected_gain(rounds) < _WORTH:
+                    return
+
+
+def _reached(run: Path, step: int) -> list[float]:
+    """Returns the PSNR of the held-out pixels after each round up to an iteration."""
+    lines = run_folder.read_metrics(run) if step else []
+    ends = range(backdrop_solver.ROUND, step + 1, backdrop_solver.ROUND)
+    return [float(line["psnr_held_out"]) for line in lines if line["step"] in ends]
+
+
+def _expected_gain(rounds: Sequence[float]) -> float:
+    """Returns by how much a PSNR will rise in the next round, dB, if gains fall geometrically.
+
+    It is infinite before the third round, as the first two do not take all pixels.
+    """
+    if len(rounds) < 3:
+        return math.inf
+    before, last = rounds[-2] - rounds[-3], rounds[-1] - rounds[-2]
+    return last * min(1.0, last / before) if last > 0.0 < before else last
 
 
 def _read(
@@ -203,7 +234,7 @@ def solve(
 ) -> int:
     """Solves for the backdrop of a run, and returns the number of the last iteration.
 
-    A checkpoint is written after each round of iterations; the solver may be done before the last.
+    A checkpoint is written after each round of iterations; the solver may stop before the last.
 
     Args:
       run: folder of the run.

@@ -10,7 +10,7 @@ Gauss-Newton method); saturated pixels that are predicted brighter, and outliers
 outlines, lose their weight. A weak prior on the details of the pyramid determines vertices that no
 pixel sees: they continue their surroundings smoothly.
 
-A fraction of the pixels is held out; their error decides when to stop.
+A fraction of the pixels is held out; their error tells when to stop.
 
 Learned tints and absorption take turns with the radiance: each round begins with Gauss-Newton steps
 of non-negative densities. The first round uses only pixels that see the surface directly.
@@ -74,9 +74,6 @@ _FEWEST_PIXELS = 200_000
 
 # Factor by which the weight of the pixels of earlier rounds falls in every round.
 _FADES = 0.5
-
-# A round that improves the held-out pixels by less, in dB, is the last.
-_WORTH = 0.02
 
 # Most Gauss-Newton steps of the tints in a round, and the change of a density that ends them; most
 # pixels of a block that determine them.
@@ -223,7 +220,7 @@ def solve(
     tint_decay: float = 0.0,
     thinned_rounds: int = 2,
 ) -> Iterator[Progress]:
-    """Yields the state after each iteration; it may stop earlier than asked.
+    """Yields the state after each iteration.
 
     Each `ROUND` of iterations depends only on the radiance, tints and gains at its start: a run
     that is continued from there is the same as one without a pause.
@@ -231,10 +228,10 @@ def solve(
     Args:
       blocks: equations of all views; or a function of the number of a round to its equations, where
         all of them do not fit in memory. A round then also keeps to its start, the more so the more
-        pixels of earlier rounds have seen a vertex, and all iterations are taken.
+        pixels of earlier rounds have seen a vertex.
       space: kind of the surface.
       resolution: number of cells per side of a face.
-      iterations: largest number of iterations.
+      iterations: number of iterations.
       start: number of iterations, a multiple of `ROUND`, and radiance of an earlier run.
       tints: tints and absorption to begin with, if they are learned.
       gains: logarithm of the gain of each image to begin with, if they are learned.
@@ -267,9 +264,7 @@ def solve(
     while state.step < iterations:
         number, count = state.step // ROUND, min(ROUND, iterations - state.step)
         # Nothing here refers to the equations of a round: they are freed before the next ones.
-        state, before = yield from _round(draw(number), tinted, known, state, count, streams)
-        if state.held_out < before + _WORTH and number >= thinned_rounds and not streams:
-            return
+        state = yield from _round(draw(number), tinted, known, state, count, streams)
 
 
 class _Known(NamedTuple):
@@ -300,7 +295,7 @@ def _round(
     state: Progress,
     count: int,
     streams: bool,
-) -> Generator[Progress, None, tuple[Progress, float]]:
+) -> Generator[Progress, None, Progress]:
     """Takes a round of iterations, with the same weights of the pixels.
 
     Args:
@@ -312,14 +307,14 @@ def _round(
       streams: whether the next round has other equations.
 
     Returns:
-      The last state, and the PSNR of the held-out pixels at the start.
+      The last state.
     """
     space, resolution, step = known.space, known.resolution, state.step
     tints, gains, held, levels = state.tints, state.gains, state.held, state.pyramid
-    before, typical = -math.inf, math.inf
+    typical = math.inf
     if step:
         seen = System(blocks, space, resolution, tints, gains).see(levels)
-        _, before, typical = _measure(blocks, seen)
+        _, _, typical = _measure(blocks, seen)
         if tints is not None:
             behind = tinted or [_tinted(block) for block in blocks]
             brightened, mips = [exposed(b, gains) for b in behind], images.mipmap(levels, space)
@@ -342,7 +337,7 @@ def _round(
         changed = None if gains is None else system.gains(x)
         state = Progress(state.step + 1, x.levels, tints, changed, held, fitted, held_out)
         yield state
-    return state, before
+    return state
 
 
 def _priors(system: System, uniform: Pyramid, prior: float, held: Pyramid | None) -> _Priors:

@@ -19,6 +19,7 @@ For straight rays, which ignore objects, all three are the median, as for the pa
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -141,7 +142,10 @@ def evaluate(
     truth = read_truth(Path(scene), split)
     chosen = spread(len(truth.images), limit)
     views = truth.frames.cameras
-    images.warm_up(model, views, rays_per_pixel=rays_per_pixel, chunk=chunk)
+    with ThreadPoolExecutor(1) as beside:
+        compiled = beside.submit(_warm_up_measures, truth, perceptual)
+        images.warm_up(model, views, rays_per_pixel=rays_per_pixel, chunk=chunk)
+        compiled.result()
     if progress is not None:
         progress(0, len(chosen), "")
     per_image: list[dict[str, Any]] = []
@@ -161,6 +165,12 @@ def evaluate(
     results = {key: mean_of(per_image, key) for key in per_image[0] if key != "name"}
     results["seconds_per_image"] = results.pop("seconds")
     return Evaluation(results, learned_colours(model), per_image)
+
+
+def _warm_up_measures(truth: Truth, perceptual: Perceptual) -> None:
+    """Compiles the metrics of a split's images, by measuring an empty one."""
+    empty = np.zeros(truth.images.shape[1:], np.float32)
+    measure_view(empty, empty[..., 0], truth, 0, perceptual=perceptual)
 
 
 def learned_colours(model: Model) -> dict[str, Any] | None:

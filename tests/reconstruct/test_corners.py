@@ -11,11 +11,10 @@ from refref_jax.geometry.cameras import project
 from refref_jax.geometry.triangle_meshes import face_normals, is_closed
 from refref_jax.reconstruct import ReconstructionError, convex, polytope_fit
 from refref_jax.reconstruct.grids import find_isosurface
-from refref_jax.reconstruct.masks import Views
+from refref_jax.reconstruct.masks import Views, carve
 from refref_jax.reconstruct.mesh_distance import silhouette_overlap
 from refref_jax.reconstruct.polytope_fit import fit_corners
 from refref_jax.reconstruct.refinement import Refinement, refine
-from refref_jax.reconstruct.visual_hull import carve
 from tests.factories import bodies
 from tests.factories.scenes import volume_of
 

@@ -8,7 +8,7 @@ from refref_jax.data import meshes, scene_folder
 from refref_jax.geometry.triangle_meshes import make_mesh
 from refref_jax.reconstruct import ReconstructionError
 from refref_jax.reconstruct.grids import find_isosurface
-from refref_jax.reconstruct.masks import Views
+from refref_jax.reconstruct.masks import Views, carve
 from refref_jax.reconstruct.mesh_distance import (
     carved_alone,
     compare_meshes,
@@ -17,7 +17,6 @@ from refref_jax.reconstruct.mesh_distance import (
     without_outliers,
 )
 from refref_jax.reconstruct.refinement import Refinement, refine
-from refref_jax.reconstruct.visual_hull import carve
 from tests.factories import bodies
 
 

@@ -6,10 +6,11 @@ from scipy.ndimage import binary_dilation
 
 from refref_jax.optics.interface_rules import NO_PARENT, nested
 from refref_jax.reconstruct import gauss_newton
-from refref_jax.reconstruct import masks as outlines_module
+from refref_jax.reconstruct import outlines as outlines_module
 from refref_jax.reconstruct.families import Revolution, Sphere
 from refref_jax.reconstruct.gauss_newton import Candidate, Equations, Rows
-from refref_jax.reconstruct.masks import Outlines, Views, fit_profile
+from refref_jax.reconstruct.masks import Views
+from refref_jax.reconstruct.outlines import Outlines, fit_profile
 from refref_jax.reconstruct.revolution import Axis, Profile
 from refref_jax.reconstruct.shape_from_refraction import SingleObject
 from refref_jax.reconstruct.shapes import FixedShape, FreeSurface
@@ -19,9 +20,14 @@ _ORIGIN = np.zeros(3)
 
 
 @pytest.fixture(scope="module")
-def outlines():
+def views():
     cameras = bodies.cameras_around(8, size=120, distance=3.0)
-    return Outlines(Views(bodies.masks_of(bodies.ball, cameras), cameras))
+    return Views(bodies.masks_of(bodies.ball, cameras), cameras)
+
+
+@pytest.fixture(scope="module")
+def outlines(views):
+    return Outlines(views)
 
 
 def _rows(outlines, shape, x=None):
@@ -138,7 +144,7 @@ def test_outlines_alone_determine_the_profile_of_a_body_of_revolution():
     points[[0, -1], 0] = 0.0
     axis = Axis(np.array([0.01, -0.01, 0.0]), np.eye(3))
     outer = Revolution(axis, Profile(points, closed=False), 2.0)
-    found = fit_profile(outer, Outlines(views))
+    found = fit_profile(outer, views)
     np.testing.assert_allclose(found.axis.point[:2], 0.0, atol=2e-3)
     assert found.axis.frame[2, 2] == pytest.approx(1.0, abs=1e-4)
     off = _radial_errors(found.points + np.array([0.0, found.axis.point[2]]))
@@ -160,7 +166,7 @@ def test_a_ring_is_fitted_to_its_outlines():
     angle = np.linspace(0.0, 2.0 * np.pi, 160, endpoint=False)
     points = [0.7, 0.0] + 0.28 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     ring = Revolution(Axis(_ORIGIN, np.eye(3)), Profile(points, closed=True), 2.0)
-    found = fit_profile(ring, Outlines(views))
+    found = fit_profile(ring, views)
     assert found.closed
     tube = np.linalg.norm(found.points - [0.7, -found.axis.point[2]], axis=-1)
     # Its innermost part is no outline in most views.
@@ -168,10 +174,100 @@ def test_a_ring_is_fitted_to_its_outlines():
     assert np.abs(tube[outside] - 0.3).max() < 0.01
 
 
-def test_a_profile_far_from_all_outlines_stays_as_it_is(outlines):
+def test_a_profile_far_from_all_outlines_stays_as_it_is(views):
     angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 200)
     points = 0.5 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     points[[0, -1], 0] = 0.0
     small = Revolution(Axis(_ORIGIN, np.eye(3)), Profile(points, closed=False), 1.0)
-    found = fit_profile(small, outlines)
+    found = fit_profile(small, views)
     np.testing.assert_allclose(np.linalg.norm(found.points, axis=-1), 0.5, atol=1e-3)
+
+
+def test_a_single_view_fits_a_profile(views):
+    cameras = views.cameras._replace(poses=views.cameras.poses[:1])
+    found = fit_profile(_upright(_round(0.96)), Views(views.masks[:1], cameras))
+    assert np.all(np.isfinite(found.points)) and found.points[:, 0].max() > 0.97
+
+
+def _upright(points, **options):
+    """A body of revolution about z with a profile."""
+    points = np.array(points)
+    points[[0, -1], 0] = 0.0
+    return Revolution(Axis(_ORIGIN, np.eye(3)), Profile(points, closed=False), 2.0, **options)
+
+
+def _round(radius):
+    angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 400)
+    return radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+
+def _rays_of(views):
+    return outlines_module._pixels_beside(views, seed=0)[0].rays
+
+
+@pytest.mark.parametrize("radius", [0.9, 1.02])
+def test_depths_in_a_ball_are_those_of_its_nearest_point(views, radius):
+    body, rays = _upright(_round(radius)), _rays_of(views)
+    found = outlines_module._deepest(body, body.start(), rays)
+    near = rays.origins - np.sum(rays.origins * rays.directions, axis=-1)[:, None] * rays.directions
+    depths = (radius - np.linalg.norm(near, axis=-1)) / found.pixel
+    np.testing.assert_allclose(found.depths, depths, atol=0.02)
+    # A square of the solid angle of the pixel, at the distance of the outline.
+    width = 3.0 / views.cameras.focal * (1.0 - radius**2 / 9.0) ** 1.25
+    assert np.median(found.pixel) == pytest.approx(width, rel=0.05)
+
+
+@pytest.mark.parametrize("knots", [36, 200])
+def test_derivatives_of_depths_are_central_differences(views, knots):
+    profile = _round(0.97) * np.linspace(0.9, 1.1, 400)[:, None]
+    body, rays = _upright(profile, knots=knots), _rays_of(views)
+    wave = np.cos(np.linspace(0.0, 9.0, knots))
+    x, direction = (
+        np.append([0.02, -0.03, 0.01, 0.02], 0.01 * wave),
+        np.append(np.ones(4), wave[::-1]),
+    )
+    rows = outlines_module._depths_by_unknowns(body, x, outlines_module._deepest(body, x, rays))
+    step = 1e-5
+    up, down = (
+        outlines_module._deepest(body, x + t * direction, rays).depths for t in (step, -step)
+    )
+    slopes = (up - down) / (2.0 * step)
+    # The place on a ray is found to a few thousandths, where the depth is nearly level.
+    off = np.abs(rows @ direction - slopes)
+    assert np.quantile(off, 0.95) < 0.02 * np.abs(slopes).max() and np.abs(slopes).max() > 30.0
+
+
+_RINGS = (-0.4, 0.0, 0.37)
+
+
+def _ringed(points):
+    """Less than the distance from a cylinder with three rings, two pixels wide."""
+    height, radius = points[..., 2], np.hypot(points[..., 0], points[..., 1])
+    wall = 0.5 + sum(0.025 * np.exp(-(((height - at) / 0.03) ** 2)) for at in _RINGS)
+    return np.maximum(0.6 * (radius - wall), np.abs(height) - 0.8)
+
+
+def test_rings_as_narrow_as_pixels_are_found_in_masks(monkeypatch):
+    monkeypatch.setattr(outlines_module, "_FITTED", 8000)
+    monkeypatch.setattr(outlines_module, "_JUDGES", 4000)
+    cameras = bodies.cameras_around(24, size=120, distance=3.0)
+    views = Views(bodies.masks_of(_ringed, cameras, steps=120), cameras)
+    height = np.linspace(-0.8, 0.8, 300)
+    wall = np.stack([np.full(300, 0.49), height], axis=-1)
+    lids = np.linspace(0.0, 0.49, 60)[:-1]
+    bottom, top = (np.stack([lids, np.full(59, z)], axis=-1) for z in (-0.8, 0.8))
+    outer = _upright(np.concatenate([bottom, wall, top[::-1]]))
+    found = fit_profile(outer, views)
+    assert found.knots > outer.knots
+    heights = found.points[:, 1] + found.axis.point[2]
+    for at in _RINGS:
+        ring, beside = np.abs(heights - at) < 0.02, np.abs(np.abs(heights - at) - 0.12) < 0.04
+        ridge = found.points[ring, 0].max() - np.median(found.points[beside, 0])
+        assert 0.016 < ridge < 0.034
+        # An inner wall follows less than half of them.
+        base = found.base[ring, 0].max() - np.median(found.base[beside, 0])
+        assert base < 0.5 * ridge
+    smooth = np.abs(heights) < 0.6
+    for at in _RINGS:
+        smooth &= np.abs(heights - at) > 0.08
+    assert np.abs(found.points[smooth, 0] - 0.5).max() < 0.006

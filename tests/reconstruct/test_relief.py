@@ -13,8 +13,9 @@ from refref_jax.geometry.triangle_meshes import (
 from refref_jax.reconstruct.contents import Detail, Interior
 from refref_jax.reconstruct.families import Revolution, fit_revolution
 from refref_jax.reconstruct.interiors import Vessel
-from refref_jax.reconstruct.masks import Outlines, Views, fit_profile
+from refref_jax.reconstruct.masks import Views
 from refref_jax.reconstruct.mesh_distance import signed_distance
+from refref_jax.reconstruct.outlines import fit_profile
 from refref_jax.reconstruct.relief import Relief, measure_relief
 from refref_jax.reconstruct.revolution import Axis, Profile
 from tests.factories import bodies, revolved, vessels
@@ -158,7 +159,7 @@ def test_outlines_decide_about_the_relief():
     mesh = _stretched(revolved.revolve(points / 0.88 * 0.9, azimuths=128))
     relief = measure_relief(mesh, _UPRIGHT)
     six_sided, ball = (
-        Outlines(Views(bodies.masks_of(solid, cameras, steps=120), cameras))
+        Views(bodies.masks_of(solid, cameras, steps=120), cameras)
         for solid in (_ball_with_six_sides, lambda p: bodies.ball(p, radius=0.9))
     )
     found = [fit_profile(outer, six_sided, relief=each) for each in (None, relief)]

@@ -14,7 +14,7 @@ from refref_jax.data import scene_folder
 from refref_jax.geometry.cameras import image_rays
 from refref_jax.render import Model, pixels, render_image, render_rays
 from refref_jax.render.model import look_up
-from refref_jax.training import backdrop_solver, run_folder
+from refref_jax.training import backdrop_fit, backdrop_solver, run_folder
 from refref_jax.training.config import TrainConfig
 from refref_jax.training.fit import Periods, fit, prepare
 from tests.factories.cut_ball import cut_ball
@@ -152,6 +152,36 @@ def test_a_paused_run_continues_to_the_same_bits(scene, run, tmp_path):
     assert all(np.array_equal(ours, theirs) for ours, theirs in pairs)
     fit(None, out=tmp_path / "run", existing="resume", report=lines.append)
     assert "trained already" in lines[-1]
+
+
+def test_a_paused_run_stops_where_one_without_a_pause_stops(scene, tmp_path):
+    config = _config(scene).override(iterations=20 * _ROUND, backdrop_resolution=16)
+
+    def train(name, rounds=None):
+        out, count = tmp_path / name, rounds and rounds * _ROUND
+        stop = (lambda: len(run_folder.read_metrics(out)) == count) if count else lambda: False
+        existing = "resume" if out.exists() else "refuse"
+        fit(config, out=out, existing=existing, stop=stop, report=lambda line: None)
+        return run_folder.read_metrics(out)[-1]["step"]
+
+    whole = train("whole")
+    assert 3 * _ROUND <= whole < 20 * _ROUND
+    assert train("paused", rounds=whole // _ROUND - 1) == whole - _ROUND
+    assert train("paused") == whole
+
+
+@pytest.mark.parametrize(
+    ("rounds", "expected"),
+    [
+        ([30.0, 34.0], np.inf),
+        ([30.0, 34.0, 35.0], 0.25),  # a quarter of the gain before
+        ([20.0, 30.0, 31.0, 33.0], 2.0),  # gains that grow go on
+        ([30.0, 31.0, 30.9], -0.1),
+        ([30.0, 29.0, 29.1], 0.1),
+    ],
+)
+def test_gains_of_rounds_are_expected_to_fall_geometrically(rounds, expected):
+    assert backdrop_fit._expected_gain(rounds) == pytest.approx(expected)
 
 
 def test_gains_of_the_images_are_learned_resumed_and_written(scene, tmp_path):

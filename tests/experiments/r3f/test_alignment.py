@@ -12,7 +12,8 @@ from refref_jax.data import SceneError, meshes
 from refref_jax.geometry.triangle_meshes import make_mesh
 from refref_jax.optics.interface_rules import NO_PARENT, nested
 from refref_jax.reconstruct import ReconstructionError
-from refref_jax.reconstruct.masks import Outlines, Views
+from refref_jax.reconstruct.masks import Views
+from refref_jax.reconstruct.outlines import Outlines
 from refref_jax.training.config import TrainConfig
 from tests.factories import bodies, scenes
 from tests.factories.silhouettes import RADIUS, write_scene

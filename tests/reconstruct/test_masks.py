@@ -7,8 +7,13 @@ import pytest
 from refref_jax.geometry.triangle_meshes import volume
 from refref_jax.reconstruct import ReconstructionError
 from refref_jax.reconstruct.grids import Box, Grid, find_isosurface, gradient, interpolate, sample
-from refref_jax.reconstruct.masks import check_masks, signed_distances
-from refref_jax.reconstruct.visual_hull import LEAST_RESOLUTION, carve, hull_field
+from refref_jax.reconstruct.masks import (
+    LEAST_RESOLUTION,
+    carve,
+    check_masks,
+    hull_field,
+    signed_distances,
+)
 from tests.factories import bodies
 
 _BOX = Box(np.full(3, -1.5), np.full(3, 1.5))
