@@ -182,7 +182,13 @@ def _traced_operations(material):
     return scene, sum(_tracing(scene, TREE).values())
 
 
-@pytest.mark.parametrize("name", _MATERIALS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if name in ("opaque", "rough") else pytest.mark.slow)
+        for name in _MATERIALS
+    ],
+)
 def test_each_material_costs_operations_only_where_a_part_has_it(name):
     material, needed = _MATERIALS[name]
     (_, interfaces), operations = _traced_operations(material)

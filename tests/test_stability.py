@@ -9,8 +9,12 @@ from benchmarks.stability.measures import MEASURES
 pytestmark = pytest.mark.longest
 
 
+_SLOW = ("ball, float64", "slabs of all ratios and angles, float64")
+
+
 def _case(measure):
-    return pytest.param(measure, id=measure.name, marks=[pytest.mark.slow] if measure.slow else [])
+    slow = measure.slow or measure.name in _SLOW
+    return pytest.param(measure, id=measure.name, marks=[pytest.mark.slow] if slow else [])
 
 
 @pytest.mark.parametrize("measure", [_case(measure) for measure in MEASURES])

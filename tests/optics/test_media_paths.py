@@ -372,6 +372,7 @@ def test_facing_bends_light_by_faces_whatever_the_media():
     assert np.any(found.media != expected.media)
 
 
+@pytest.mark.slow
 def test_facing_with_overlaps_has_the_same_media_in_the_differentiable_tracer():
     scene = scenes.build(*_overlapping_cup(), rule="facing")
     ray = Rays(jnp.array([-3.0, 0.1, 0.2]), jnp.array([1.0, 0.0, 0.0]), jnp.float32(1e-3))

@@ -212,6 +212,7 @@ def test_a_budget_that_just_suffices_escapes():
     assert paths.statuses[0] == PathStatus.ESCAPED
 
 
+@pytest.mark.slow
 def test_rays_that_miss_stay_straight():
     scene = scenes.build(scenes.ball(1.0, subdivisions=3))
     rays = scenes.rays([[-4.0, y, 0.0] for y in (2.0, -1.5, 9.0)], [1.0, 0.0, 0.0])

@@ -193,6 +193,7 @@ def _bend(config, wanted, monkeypatch, path=None):
     return t, places, bent, losses
 
 
+@pytest.mark.slow
 def test_knots_become_the_corners_of_a_polyline(monkeypatch):
     """Only what moves a knot across its ray counts."""
     config = _config("raydef_polyline")

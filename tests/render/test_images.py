@@ -143,6 +143,7 @@ def test_rays_that_miss_pay_nothing_for_reflection(model, rays):
     assert count - int(straight.count) == np.sum(reflections) == hits
 
 
+@pytest.mark.slow
 def test_gradients_reach_the_fields_and_are_finite(model, rays):
     flat = jax.tree.map(lambda x: x[::16], _first(rays, 256))
 

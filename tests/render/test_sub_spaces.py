@@ -268,7 +268,7 @@ def test_light_of_a_backdrop_passes_through_each_sub_space_by_itself(planted):
 
 @pytest.mark.parametrize(
     "settings",
-    [pytest.param(STRAIGHT, marks=pytest.mark.slow), TREE],
+    [STRAIGHT, pytest.param(TREE, marks=pytest.mark.slow)],
     ids=["straight", "tree"],
 )
 def test_it_renders_along_straight_and_bent_paths(settings):

@@ -133,8 +133,8 @@ def test_the_end_of_the_training_is_the_default_progress():
 @pytest.mark.parametrize(
     ("config", "settings"),
     [
-        pytest.param(_CONFIG, STRAIGHT, marks=pytest.mark.slow, id="neus-straight"),
-        pytest.param(_CONFIG, TREE, id="neus-tree"),
+        pytest.param(_CONFIG, STRAIGHT, id="neus-straight"),
+        pytest.param(_CONFIG, TREE, marks=pytest.mark.slow, id="neus-tree"),
         pytest.param(_UNISURF, STRAIGHT, marks=pytest.mark.slow, id="unisurf-straight"),
         pytest.param(_UNISURF, TREE, marks=pytest.mark.slow, id="unisurf-tree"),
     ],

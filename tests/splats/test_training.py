@@ -42,6 +42,7 @@ def _last(setup, state, until, every=(5,)):
     return last
 
 
+@pytest.mark.slow
 def test_the_similarity_is_that_of_the_metric():
     draw = np.random.default_rng(0)
     target = draw.uniform(size=(30, 21, 3)).astype(np.float32)

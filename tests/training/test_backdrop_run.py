@@ -239,6 +239,7 @@ def test_a_field_on_opaque_parts_is_trained_in_front_of_the_backdrop(filled, tmp
     assert all(np.array_equal(ours, theirs) for ours, theirs in pairs)
 
 
+@pytest.mark.slow
 def test_opaque_parts_lead_to_a_backdrop_with_a_field_in_front_of_it(filled):
     resolved, _ = prepare(TrainConfig().override(scene=str(filled)), report=lambda line: None)
     assert resolved.config.model.far_field == "backdrop"

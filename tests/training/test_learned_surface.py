@@ -1,5 +1,6 @@
 """A surface that bends light: its start from meshes, its steps, its runs, and what is refused."""
 
+import dataclasses
 import functools
 import json
 import shutil
@@ -17,6 +18,7 @@ from refref_jax.render.model import ball_of, surface_scene
 from refref_jax.training import evaluation, fit, learned_surface, loop, run_folder
 from refref_jax.training.config import TrainConfig
 from tests.factories import scenes
+from tests.factories.small_model import initial_field
 from tests.processes.command import ROOT, run_command
 
 pytestmark = pytest.mark.loose
@@ -204,7 +206,7 @@ def test_a_learned_index_returns_from_its_bounds(index):
     config = fit.prepare(
         _config(surface_index=index, surface_index_from="learned"), report=lambda line: None
     )[0].model.config.field
-    params = jax.jit(lambda: tnsr.init_radiance(jax.random.key(0), config))()
+    params = initial_field(dataclasses.replace(config, index=1.5))
 
     @jax.jit
     @jax.value_and_grad

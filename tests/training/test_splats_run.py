@@ -84,6 +84,7 @@ def test_images_are_rendered_and_smaller_pixels_average_to_them(trained):
     images.warm_up(model, CAMERAS, rays_per_pixel=1, chunk=None)
 
 
+@pytest.mark.slow
 def test_the_viewer_draws_windows_of_images(trained):
     model = trained[0]
     subject = session.Subject("made", model, "nested", None, (), (9, 18), None)
@@ -99,6 +100,7 @@ def test_the_viewer_draws_windows_of_images(trained):
         assert distance.shape == seen.shape and np.ptp(distance) > 0
 
 
+@pytest.mark.slow
 def test_the_viewer_draws_the_error_of_a_test_view(trained):
     frames = scene_folder.read_frames(_SCENE, "test")
     pixels = layers.view_pixels(frames, 3, 32 * 32)

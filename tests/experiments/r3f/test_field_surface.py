@@ -89,6 +89,7 @@ def test_a_field_without_a_surface_is_told():
         field_surface._largest(nothing)
 
 
+@pytest.mark.slow
 def test_a_scene_without_masks_gets_silhouettes_of_the_surface(bare, untrained, tmp_path):
     masked = field_surface.masked_scene(bare, tmp_path, _CONFIG)
     assert masked.name == bare.name and masked != bare
