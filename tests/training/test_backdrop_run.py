@@ -154,6 +154,7 @@ def test_a_paused_run_continues_to_the_same_bits(scene, run, tmp_path):
     assert "trained already" in lines[-1]
 
 
+@pytest.mark.slow
 def test_a_paused_run_stops_where_one_without_a_pause_stops(scene, tmp_path):
     config = _config(scene).override(iterations=20 * _ROUND, backdrop_resolution=16)
 
