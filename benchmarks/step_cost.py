@@ -1,6 +1,7 @@
 """Claim: a step along the paper's paths costs at most 1.25 straight ones, along the tree 1.5.
 
-    python -m benchmarks.step_cost [--scene=FOLDER] [--rounds=N] [--variants=NAME,NAME]
+    python -m benchmarks.step_cost [--scene=FOLDER] [--rounds=N] [--variants=NAME,NAME] \
+        [--samples=N,N]
 
 All models have the same samples per path, and the scene analysis of training. They are stepped in
 turn in one process, so that ratios hold when the machine's speed drifts. A step includes its share
@@ -33,6 +34,8 @@ _PRESET = flags.DEFINE_string("preset", "tiny", "Preset of all models.")
 _ROUNDS = flags.DEFINE_integer(
     "rounds", 8, "Number of times that each model steps the batches of two pre-tracings."
 )
+
+_SAMPLES = flags.DEFINE_list("samples", None, "Samples of each level; by default the preset's.")
 
 _KNOWN = ("few", "devices", "proposals")
 _VARIANTS = flags.DEFINE_list("variants", [], f"Variants of steps: {', '.join(_KNOWN)}.")
@@ -67,7 +70,7 @@ class _Method:
             scene,
             preset=_PRESET.value,
             paths=paths,
-            samples=_FEW if variant == "few" else None,
+            samples=_FEW if variant == "few" else _samples(),
             mesh=devices.row(2) if variant == "devices" else None,
         )
         self._total = objective.total
@@ -98,6 +101,10 @@ class _Method:
             return _Cost(step, tracing)
         share = -(-batches // pretraced) * pretraced / self._setup.config.schedule.steps
         return _Cost(step + share * tracing, share * tracing)
+
+
+def _samples() -> tuple[int, ...] | None:
+    return None if _SAMPLES.value is None else tuple(map(int, _SAMPLES.value))
 
 
 def _without_proposals(

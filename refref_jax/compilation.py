@@ -1,11 +1,12 @@
-"""Settings of compilation: native loops, functions by platform, slow versions, the traversal.
+"""Settings of compilation and of the host: native loops, platforms, threads, slow versions.
 
 XLA:CPU runs a `while_loop` as many small kernels, dispatched one by one. A call with the attribute
 set by `native_loop` is instead emitted as one function with real control flow, which makes BVH
 traversal about five times faster. The attribute is internal to XLA: versions that do not know it
 ignore it, and only the speed changes.
 
-`chosen_by_platform` makes one function of two, for CPUs and for other devices.
+`chosen_by_platform` makes one function of two, for CPUs and for other devices. `at_once` runs
+programs in several threads of the host.
 
 Some versions compile scatter-adds of single floats for NVIDIA GPUs as loops that compare and swap,
 hundreds of times slower than an addition in memory. `add_missing_flag` sets the flag that they
@@ -15,11 +16,13 @@ The environment variable `REFREF_TRAVERSAL` chooses how closest hits are found. 
 compiled already keep what they were compiled with.
 """
 
+import contextlib
 import functools
 import importlib.metadata
 import os
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Literal, ParamSpec, TypeVar
 
 import jax
@@ -44,6 +47,24 @@ TRAVERSAL = "REFREF_TRAVERSAL"
 
 # Older versions do not offer kernels to JAX on CPUs.
 _WARP = (1, 19)
+
+# Chooses XLA:CPU's older code generator; other versions may not have this option.
+_OLDER = {"xla_cpu_use_fusion_emitters": False}
+_HAVE_IT = importlib.metadata.version("jaxlib").startswith("0.10.")
+
+jit_quickly = functools.partial(jax.jit, compiler_options=_OLDER if _HAVE_IT else None)
+"""`jax.jit` for programs that the host calls, and that run no longer than they compile.
+
+On CPUs they compile in two thirds of the time, with 0.3 GB less memory. Programs that trace paths
+and render run as fast; the steps of a field are a tenth slower and take `jax.jit`.
+"""
+
+# Settings of JAX that a new thread would have by default.
+_OF_A_THREAD: dict[str, Callable[[Any], Any]] = {
+    "jax_enable_x64": jax.enable_x64,
+    "jax_default_device": jax.default_device,
+    "jax_numpy_dtype_promotion": jax.numpy_dtype_promotion,
+}
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
@@ -160,6 +181,24 @@ def chosen_by_platform(
 def runs_on_cpu() -> bool:
     """Returns whether this process computes on CPUs, for sizes that the host chooses."""
     return jax.default_backend() == "cpu"
+
+
+def at_once(function: Callable[..., _Result], *each: Sequence[Any]) -> list[_Result]:
+    """Returns the results of a function of corresponding elements, on CPUs two at once.
+
+    A program leaves a core idle where it has one thread, and all of them while the host prepares
+    the next program. Both threads have the settings of JAX that the calling thread has.
+    """
+    settings = [(set_to, getattr(jax.config, name)) for name, set_to in _OF_A_THREAD.items()]
+
+    def here(*elements: Any) -> _Result:
+        with contextlib.ExitStack() as stack:
+            for set_to, value in settings:
+                stack.enter_context(set_to(value))
+            return function(*elements)
+
+    with ThreadPoolExecutor(2 if runs_on_cpu() else 1) as threads:
+        return list(threads.map(here, *each))
 
 
 def add_missing_flag() -> None:

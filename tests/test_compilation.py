@@ -8,6 +8,8 @@ import importlib.metadata
 import os
 import subprocess
 import sys
+import threading
+import time
 import warnings
 
 import jax
@@ -169,3 +171,53 @@ def test_only_the_function_for_the_platform_is_traced_and_once(platform, name, m
     program = jax.jit(function).trace(pair)
     text = program.lower(lowering_platforms=(platform,)).as_text()
     assert traced == [name] and ("sine" in text) == (name == "other")
+
+
+def test_results_that_are_computed_at_once_keep_their_order():
+    both = threading.Barrier(2, timeout=60.0)
+
+    def wait(x, y):
+        both.wait()  # breaks unless two run at once
+        return x - y
+
+    assert compilation.at_once(wait, range(4), (1, 2, 3, 4)) == [-1, -1, -1, -1]
+    assert compilation.at_once(wait, (), ()) == []
+
+
+def test_an_accelerator_takes_one_after_the_other(monkeypatch):
+    monkeypatch.setattr(compilation, "runs_on_cpu", lambda: False)
+    threads = compilation.at_once(lambda _: threading.get_ident(), range(8))
+    assert len(set(threads)) == 1
+
+
+def test_threads_have_the_settings_of_the_calling_one():
+    def doubled(x):
+        return jnp.asarray(x).dtype, (jnp.arange(2) * jnp.float32(0.5)).dtype
+
+    with jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):
+        assert compilation.at_once(doubled, [1.5]) == [(jnp.float64, jnp.float32)]
+    with pytest.raises(ValueError, match="strict"):
+        compilation.at_once(doubled, [1.5])  # the suite's promotion is strict
+
+
+def test_the_first_error_ends_what_is_computed_at_once():
+    begun = []
+
+    def fail(x):
+        begun.append(x)
+        time.sleep(0.01 * x)
+        raise KeyError(x)
+
+    with pytest.raises(KeyError, match="0"):
+        compilation.at_once(fail, range(100))
+    assert len(begun) < 100
+
+
+def test_programs_that_compile_quickly_compute_the_same():
+    x = jnp.linspace(-3.0, 3.0, 101)
+
+    def falling(x, *, power):
+        return jnp.exp(-x) ** power
+
+    quick = compilation.jit_quickly(falling, static_argnames="power")
+    np.testing.assert_allclose(quick(x, power=2), np.exp(-2.0 * np.asarray(x)), rtol=1e-6)

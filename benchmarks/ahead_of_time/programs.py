@@ -72,7 +72,7 @@ def training(preset: str, multiple: int = loop.MULTIPLE) -> tuple[Program, Progr
         "capacity": capacity,
         "detail": path_detail(model.config, model.settings),
     }
-    traced = jax.eval_shape(lambda *x: loop.pretrace(*x, **tracing), scene, rays)
+    traced = loop.pretrace.eval_shape(scene, rays, **tracing)
     pretraced = loop.PretracedBatches(
         traced,
         jax.ShapeDtypeStruct((batches, batch, 3), jnp.uint8),
@@ -104,9 +104,18 @@ def backdrop_product() -> Program:
 
 
 def _product(levels: backdrop.Pyramid, block: Block) -> backdrop.Pyramid:
-    seen = backdrop_equations._predict(images.mipmap(levels, "unbounded"), block)
-    spread = backdrop_equations._transposed(seen, block, resolution=_RESOLUTION)
-    return backdrop_equations._mipmap_transposed(spread, "unbounded")
+    # Programs with options of their own cannot be a part of another one.
+    mipmap, predict, transposed, mipmap_transposed = (
+        compiled.__wrapped__
+        for compiled in (
+            images.mipmap,
+            backdrop_equations._predict,
+            backdrop_equations._transposed,
+            backdrop_equations._mipmap_transposed,
+        )
+    )
+    spread = transposed(predict(mipmap(levels, "unbounded"), block), block, resolution=_RESOLUTION)
+    return mipmap_transposed(spread, "unbounded")
 
 
 def _straight_lookups(rays: Rays, domain: Domain) -> backdrop.Lookups:

@@ -28,6 +28,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax import numerics
+from refref_jax.compilation import at_once, jit_quickly
 from refref_jax.geometry import bvh_build
 from refref_jax.geometry.bvh import NO_PRIMITIVE
 from refref_jax.geometry.rays import Rays
@@ -209,7 +210,7 @@ def blurred(surface: Backdrop, halvings: int) -> Backdrop:
     return surface._replace(mips=_mipmap(pyramid, space=surface.domain.space))
 
 
-_mipmap = jax.jit(backdrop.mipmap, static_argnames="space")
+_mipmap = jit_quickly(backdrop.mipmap, static_argnames="space")
 
 
 def predict(traced: TracedObject, surface: Backdrop, rays: Rays) -> Prediction:
@@ -240,7 +241,7 @@ def inner_segments(traced: TracedObject, rays: Rays) -> InnerSegments:
     return _in_tiles(lambda part: _inner_segments(traced.scene, part), rays)
 
 
-@jax.jit
+@jit_quickly
 def _inner_segments(scene: Scene, rays: Rays) -> InnerSegments:
     ahead = jnp.zeros(MAIN.max_bends, bool)
     paths = jax.vmap(lambda ray: follow_branch(scene, ray, ahead, settings=MAIN))(rays)
@@ -292,15 +293,16 @@ def _encode(linear: Float[ArrayLike, "rays 3"]) -> Float[Array, "rays 3"]:
 def _in_tiles(render: Callable[[Rays], _Tree], rays: Rays) -> _Tree:
     """Returns the results for all rays, as NumPy arrays."""
     count = rays.radii.shape[0]
-    found = []
-    for start in range(0, count, _TILE):
+
+    def see(start: int) -> _Tree:
         part, _ = images.crop(rays, None, start, _TILE)
         kept = min(_TILE, count - start)
-        found.append(jax.tree.map(lambda x, n=kept: np.asarray(x)[:n], render(part)))
-    return images.join(found)
+        return jax.tree.map(lambda x: np.asarray(x)[:kept], render(part))
+
+    return images.join(at_once(see, range(0, count, _TILE)))
 
 
-@functools.partial(jax.jit, static_argnames=("domain", "resolution"))
+@functools.partial(jit_quickly, static_argnames=("domain", "resolution"))
 def _predict(
     scene: Scene, mips: Mips, rays: Rays, *, domain: Domain, resolution: int
 ) -> Prediction:
@@ -314,7 +316,7 @@ def _predict(
     return Prediction(linear, jnp.max(traced.dropped, axis=-1))
 
 
-@functools.partial(jax.jit, static_argnames=("domain", "resolution"))
+@functools.partial(jit_quickly, static_argnames=("domain", "resolution"))
 def _differentiate(
     scene: Scene, mips: Mips, coverage: Mips, rays: Rays, *, domain: Domain, resolution: int
 ) -> tuple[Sensitivities, Array, Array]:

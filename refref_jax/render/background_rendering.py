@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax import numerics
 from refref_jax.choices import side_of
+from refref_jax.compilation import jit_quickly
 from refref_jax.geometry import cameras as pinholes
 from refref_jax.geometry.cameras import Cameras
 from refref_jax.geometry.rays import Rays
@@ -365,7 +366,7 @@ def _contrast(rgb: Float[np.ndarray, "h w rays 3"]) -> Float[np.ndarray, "h w"]:
     return spread.reshape(height, side, width, side).max(axis=(1, 3))
 
 
-@functools.partial(jax.jit, static_argnames="settings")
+@functools.partial(jit_quickly, static_argnames="settings")
 def _render_tile(
     scene: Scene,
     radiance: Radiance,

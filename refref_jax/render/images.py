@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax import numerics
 from refref_jax.choices import side_of
-from refref_jax.compilation import runs_on_cpu
+from refref_jax.compilation import at_once, jit_quickly, runs_on_cpu
 from refref_jax.geometry import bvh
 from refref_jax.geometry import cameras as pinholes
 from refref_jax.geometry.cameras import Cameras, box_filter, pixel_rays, supersample
@@ -59,16 +59,15 @@ _MOST_PARTS = 16  # that a tile is divided into, if its paths do not fit the buf
 _TIMES = 16
 
 NO_PART = -1
-
 _CAST_INSTEAD = "Call it outside, or cast single rays with bvh.closest_hits."
 _INSTEAD = "Call it outside, or use render_rays, which is a pure function."
 
-backdrop_ends = jax.jit(
+backdrop_ends = jit_quickly(
     pixels.backdrop_ends,
     static_argnames=("settings", "domain", "resolution", "most_taps", "axes", "tally", "fields"),
 )
-mipmap = jax.jit(backdrop.mipmap, static_argnames="space")
-_finish = jax.jit(pixels.finish)
+mipmap = jit_quickly(backdrop.mipmap, static_argnames="space")
+_finish = jit_quickly(pixels.finish)
 
 RAYS_OF_A_BAND = 1 << 18
 """Maximum number of rays held at once, unless one row of pixels has more."""
@@ -83,7 +82,7 @@ def in_tiles(
     instead: str,
     interior_list: Int[np.ndarray, "*rays slots"] | None = None,
 ) -> _Tree:
-    """Renders rays tile by tile, to NumPy arrays with the leading axes of the rays.
+    """Renders rays tile by tile, on CPUs two at once, to NumPy arrays like the rays.
 
     Args:
       see: function that renders a tile, given its rays, their interior lists, and the number of
@@ -101,10 +100,12 @@ def in_tiles(
     shape, count = rays.radii.shape, rays.radii.size
     axes = len(shape)
     flat, listed = jax.tree.map(lambda x: x.reshape(-1, *x.shape[axes:]), (rays, interior_list))
-    parts = [
-        _see_tile(see, *crop(flat, listed, start, tile), min(tile, count - start), instead)
-        for start in range(0, count, tile)
-    ]
+
+    def part(start: int) -> Any:
+        real = min(tile, count - start)
+        return _see_tile(see, *crop(flat, listed, start, tile), real, instead)
+
+    parts = at_once(part, range(0, count, tile))
     joined = join(parts or [nothing])
     return jax.tree.map(lambda x: x[:count].reshape((*shape, *x.shape[1:])), joined)
 
@@ -280,7 +281,7 @@ def merged(met: np.ndarray, some: np.ndarray, others: np.ndarray) -> np.ndarray:
     return whole
 
 
-@jax.jit
+@jit_quickly
 def _of_backdrop(
     params: Params, mips: Mips, ends: BackdropEnds, dropped: Float[Array, "rays 3"]
 ) -> Rendering:
@@ -318,7 +319,7 @@ def _render_tile(model: Model, rays: Rays, real: int, chunk: int, branch: Branch
     return _finish(sums)
 
 
-@functools.partial(jax.jit, static_argnames=("settings", "detail"))
+@functools.partial(jit_quickly, static_argnames=("settings", "detail"))
 def _trace_tile(
     scene: Scene,
     rays: Rays,
@@ -332,7 +333,7 @@ def _trace_tile(
     return pixels.sort_paths(traced, real, which=which)
 
 
-@functools.partial(jax.jit, static_argnames=("config", "chunk"))
+@functools.partial(jit_quickly, static_argnames=("config", "chunk"))
 def _render_chunk(
     params: Params,
     tile: TilePaths,
@@ -470,7 +471,7 @@ def find_first_surface(
     )
 
 
-@jax.jit
+@jit_quickly
 def _cast_tile(
     surfaces: Surfaces | LevelSet, rays: Rays
 ) -> tuple[Float[Array, " rays"], Float[Array, "rays 3"], Int[Array, " rays"]]:

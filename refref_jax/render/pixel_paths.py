@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from refref_jax.compilation import jit_quickly
 from refref_jax.geometry.rays import Rays
 from refref_jax.numerics import host_array
 from refref_jax.optics import path_tracing
@@ -189,7 +190,7 @@ def _polylines(traced: _Traced, reach: float) -> PixelPaths:
     )
 
 
-@functools.partial(jax.jit, static_argnames=("settings", "domain"))
+@functools.partial(jit_quickly, static_argnames=("settings", "domain"))
 def _trace(
     scene: Scene,
     ray: Rays,

@@ -10,8 +10,7 @@ meet no object are straight and are not traced. A fraction of the pixels is held
 import functools
 import itertools
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from refref_jax.choices import Space
+from refref_jax.compilation import at_once, jit_quickly
 from refref_jax.geometry import cameras as cameras_module
 from refref_jax.geometry.cameras import Cameras
 from refref_jax.geometry.rays import Rays
@@ -37,7 +37,6 @@ _HELD_OUT = 50
 # Seeds of draws begin with this number, which is no view's.
 _DRAWS = 2**31
 
-_Result = TypeVar("_Result")
 _Arrays = TypeVar("_Arrays")
 
 Gains = Float[Array, "views 3"]
@@ -215,12 +214,6 @@ def _in_tiles(
         yield seen._replace(lookups=lookups)
 
 
-def at_once(function: Callable[..., _Result], *each: Sequence[Any]) -> list[_Result]:
-    """Returns the results of a function for each block; a CPU runs as many as it has cores."""
-    with ThreadPoolExecutor(len(each[0])) as threads:
-        return list(threads.map(function, *each))
-
-
 def _block(
     seen: BackdropEnds,
     photographs: UInt8[np.ndarray, "views h w 3"],
@@ -348,7 +341,7 @@ def exposed(block: Block, gains: Gains | None) -> Block:
     return block if gains is None else _with_gains(block, gains)
 
 
-@jax.jit
+@jit_quickly
 def _with_gains(block: Block, gains: Gains) -> Block:
     gain = jnp.exp(gains)[block.views[block.lookups.pixels]]
     lookups = block.lookups._replace(throughput=block.lookups.throughput * gain)
@@ -360,7 +353,7 @@ def _with_positive_directions(block: Block) -> Block:
     return block._replace(lookups=lookups)
 
 
-@jax.jit
+@jit_quickly
 def _by_gain(
     block: Block, slopes: Array, gains: Float[Array, "views 1 1 3"]
 ) -> Float[Array, "pixels 3"]:
@@ -372,29 +365,29 @@ def _centred(gains: Float[Array, "views 1 1 3"]) -> Float[Array, "views 1 1 3"]:
     return gains - jnp.mean(gains, axis=0, keepdims=True)
 
 
-@functools.partial(jax.jit, static_argnames="views")
+@functools.partial(jit_quickly, static_argnames="views")
 def _sum_views(block: Block, values: Array, views: int) -> Float[Array, "views 3"]:
     return jax.ops.segment_sum(values, block.views, num_segments=views)
 
 
-@functools.partial(jax.jit, static_argnames="space")
+@functools.partial(jit_quickly, static_argnames="space")
 def _mipmap_transposed(mips: Mips, space: Space) -> Pyramid:
     """Returns the transpose of `mipmap`."""
     like = tuple(jnp.zeros_like(mip) for mip in mips[::-1])
     return jax.linear_transpose(lambda x: backdrop.mipmap(x, space), like)(mips)[0]
 
 
-@jax.jit
+@jit_quickly
 def _predict(mips: Mips, block: Block) -> Float[Array, "pixels 3"]:
     return backdrop.colours(mips, block.lookups, pixels=block.srgb.shape[0])
 
 
-@functools.partial(jax.jit, static_argnames="resolution")
+@functools.partial(jit_quickly, static_argnames="resolution")
 def _transposed(slopes: Array, block: Block, *, resolution: int) -> Mips:
     return backdrop.transposed(slopes, block.lookups, resolution=resolution)
 
 
-@jax.jit
+@jit_quickly
 def _attenuated(block: Block, tints: LearnedTints) -> Block:
     """Returns the equations with the throughput that tints and absorption leave."""
     dimmed = learned_media.transmittance(tints, block.crossings)
@@ -402,7 +395,7 @@ def _attenuated(block: Block, tints: LearnedTints) -> Block:
     return block._replace(lookups=lookups)
 
 
-@jax.jit
+@jit_quickly
 def sum_of(parts: Sequence[_Arrays]) -> _Arrays:
     """Returns the sum of records of arrays."""
     return jax.tree.map(lambda *x: functools.reduce(jnp.add, x), *parts)

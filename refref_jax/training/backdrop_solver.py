@@ -33,6 +33,7 @@ from jaxtyping import Array, Float
 
 from refref_jax import numerics
 from refref_jax.choices import Space
+from refref_jax.compilation import jit_quickly
 from refref_jax.render import backdrop, images, learned_media, pixels
 from refref_jax.render.backdrop import Mips, Pyramid
 from refref_jax.render.learned_media import LearnedTints
@@ -119,7 +120,7 @@ def _weights(predicted: Array, block: Block, typical: float | Array) -> Float[Ar
     return jnp.where(bright, 0.0, huber * jnp.square(secant)) * block.kept[:, None]
 
 
-@jax.jit
+@jit_quickly
 def _residuals(block: Block, predicted: Array) -> tuple[Array, Array, Array]:
     """Returns the sums of squared sRGB errors of fitted and of held-out pixels; all errors."""
     error = jnp.clip(pixels.linear_to_srgb(predicted), 0.0, 1.0) - block.srgb
@@ -170,7 +171,7 @@ class _Search(NamedTuple):
     rho: Float[Array, "3"]
 
 
-@jax.jit
+@jit_quickly
 def _begin_search(
     x: Unknowns, gradient: Unknowns, scales: Unknowns, priors: _Priors
 ) -> tuple[_Search, Unknowns, Unknowns]:
@@ -187,7 +188,7 @@ def _begin_search(
     return _Search(x, residual, direction, _dot(residual, direction)), ridge, diagonal
 
 
-@jax.jit
+@jit_quickly
 def _advance(
     state: _Search, image: Unknowns, ridge: Unknowns, diagonal: Unknowns
 ) -> tuple[_Search, Float[Array, "3"]]:
@@ -418,7 +419,7 @@ def coverage(
 # ---- Learned tints ----
 
 
-@jax.jit
+@jit_quickly
 def _is_direct(block: Block) -> Float[Array, "pixels 1"]:
     """Returns 1 for pixels none of whose light has met a part, else 0."""
     met = jnp.max(block.crossings, axis=-1, initial=0.0)
@@ -454,12 +455,12 @@ def _fit_tints(
     return learned_media.of_densities(jax.device_put(densities.astype(np.float32)))
 
 
-@jax.jit
+@jit_quickly
 def _radiance(mips: Mips, block: Block) -> Float[Array, "paths 3"]:
     return backdrop.radiance(mips, block.lookups)
 
 
-@jax.jit
+@jit_quickly
 def _tint_equations(
     densities: Float[Array, "unknowns 3"],
     seen: Float[Array, "paths 3"],

@@ -28,6 +28,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, UInt8
 
 from refref_jax import choices, metrics
+from refref_jax.compilation import jit_quickly
 from refref_jax.data import scene_folder
 from refref_jax.geometry import cameras
 from refref_jax.geometry.cameras import Cameras
@@ -39,7 +40,7 @@ Measured = dict[str, float | None]
 """Metrics by name; `None` if a metric is undefined or not available."""
 
 # Compiled as a whole, which is faster than op by op.
-_lpips = jax.jit(metrics.lpips)
+_lpips = jit_quickly(metrics.lpips)
 
 _DISTANCE_ERRORS = {"mae": metrics.mean_absolute_error, "rmse": metrics.root_mean_square_error}
 
@@ -301,7 +302,7 @@ def measure_colours(
     return result
 
 
-@jax.jit
+@jit_quickly
 def _colour_measures(
     rendered: Float[Array, "h w 3"], target: Float[Array, "h w 3"], mask: Bool[Array, "h w"] | None
 ) -> dict[str, Float[Array, ""]]:
@@ -314,7 +315,7 @@ def _colour_measures(
     return found
 
 
-@jax.jit
+@jit_quickly
 def _distance_measures(
     seen: Float[Array, "h w"], true: Float[Array, "h w"], area: Bool[Array, "h w"]
 ) -> dict[str, Float[Array, ""]]:

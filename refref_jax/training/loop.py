@@ -1,8 +1,7 @@
 """Training loop: the state of a run, pre-traced batches of light paths, and compiled steps.
 
 The light paths of many batches are traced at once (*pre-traced*), then used by consecutive steps.
-If all batches of an epoch fit in memory, they are only traced once. This is one of the modules that
-call `jax.jit`.
+If all batches of an epoch fit in memory, they are only traced once. This module calls `jax.jit`.
 """
 
 import functools
@@ -16,7 +15,7 @@ import optax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Int, UInt8
 
-from refref_jax.compilation import runs_on_cpu
+from refref_jax.compilation import jit_quickly, runs_on_cpu
 from refref_jax.data.batches import PixelSampler
 from refref_jax.fields import registry
 from refref_jax.geometry.rays import Rays
@@ -151,7 +150,7 @@ _WHOLE: Any = PartitionSpec()
 _SHARED = PretracedBatches(Traced(paths=_SHARE, dropped=_WHOLE), _WHOLE, _WHOLE, _WHOLE)
 
 
-@functools.partial(jax.jit, static_argnames=("settings", "capacity", "detail", "mesh"))
+@functools.partial(jit_quickly, static_argnames=("settings", "capacity", "detail", "mesh"))
 def pretrace(
     scene: Scene,
     rays: Rays,
@@ -182,7 +181,7 @@ def pretrace(
     return jax.lax.with_sharding_constraint(Traced(paths, dropped), shared)
 
 
-@functools.partial(jax.jit, static_argnames="settings")
+@functools.partial(jit_quickly, static_argnames="settings")
 def survey_paths(scene: Scene, rays: Rays, *, settings: PathSettings) -> Survey:
     """Returns statistics of the paths of the rays `[rays]`; see `path_tracing.survey`."""
     return path_tracing.survey(scene, rays, settings=settings)
@@ -461,17 +460,20 @@ def _pretraced_after(setup: Setup, first: int) -> PretracedBatches:
     return trace_batches(setup, numbers.tolist())
 
 
+def _tracing(setup: Setup) -> dict[str, Any]:
+    """Returns the static arguments of `pretrace`."""
+    return {
+        "settings": setup.settings,
+        "capacity": setup.capacity,
+        "detail": path_detail(setup.model, setup.settings),
+        "mesh": setup.mesh,
+    }
+
+
 def trace_batches(setup: Setup, numbers: Sequence[int]) -> PretracedBatches:
     """Traces the batches of a run with these numbers, for steps in the same order."""
     drawn = setup.sampler.draw(np.asarray(numbers))
-    traced = pretrace(
-        setup.scene,
-        drawn.rays,
-        settings=setup.settings,
-        capacity=setup.capacity,
-        detail=path_detail(setup.model, setup.settings),
-        mesh=setup.mesh,
-    )
+    traced = pretrace(setup.scene, drawn.rays, **_tracing(setup))
     order = np.arange(len(numbers), dtype=np.int32)
     views = drawn.views if setup.model.learned_gains else None
     host = drawn.rgb, order, views
@@ -482,15 +484,15 @@ def _trace_epoch(setup: Setup) -> PretracedBatches | None:
     """Traces all batches in advance, if the run uses them more than once and they fit in memory.
 
     They are traced in groups, each with its own capacity. Tracing in advance does not change
-    training, unless a group is full and drops paths: which ones depends on the batches in the
-    group.
+    training, unless a group is full and drops paths, which depend on its batches.
     """
     config, batches = setup.config, setup.sampler.batches
     size = require(config.schedule.pretraced_batches)
     groups = range(0, batches, size)
     if require(config.schedule.steps) <= batches:
         return None
-    one = jax.eval_shape(lambda: trace_batches(setup, range(size)))
+    drawn = setup.sampler.draw(setup.sampler.numbers(0, size))
+    one = pretrace.eval_shape(setup.scene, drawn.rays, **_tracing(setup)), drawn.rgb
     bytes_ = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(one))
     if bytes_ * len(groups) > _MOST_BYTES:
         return None
