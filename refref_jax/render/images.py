@@ -82,12 +82,12 @@ def in_tiles(
     instead: str,
     interior_list: Int[np.ndarray, "*rays slots"] | None = None,
 ) -> _Tree:
-    """Renders rays tile by tile, on CPUs two at once, to NumPy arrays like the rays.
+    """Renders rays tile by tile, two tiles at once on CPUs, to NumPy arrays.
 
     Args:
       see: function that renders a tile, given its rays, their interior lists, and the number of
         rays that are not padding.
-      rays: camera rays with any leading axes.
+      rays: camera rays with any leading axes, which the result has, too.
       tile: number of rays per tile.
       nothing: result for 0 rays.
       instead: advice at the end of the error message.
