@@ -48,7 +48,6 @@ def main(arguments: list[str]) -> None:
             "--ray=local",
             "--steps=2",
             "--preset=tiny",
-            "--batch=64",
             f"--out={out / 'benchmark'}",
         ]
     )
@@ -59,6 +58,7 @@ def main(arguments: list[str]) -> None:
         print(f"call {call + 1}: status {status}, {len(killed)} workers killed", flush=True)
         if status == 0:
             break
+    assert status == 0, f"jobs failed in every call: see {out / 'printed.txt'}"
     minutes = (time.monotonic() - begun) / 60
     found = json.loads((out / "benchmark" / summary.RESULTS).read_text(encoding="utf-8"))["jobs"]
     _check(found)
