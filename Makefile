@@ -28,7 +28,7 @@ PROCESSES = $(shell $(PYTHON) -c 'import os; print(min(5, 1 + (os.cpu_count() or
 PYTEST = $(RUN) pytest --numprocesses=$(PROCESSES) --dist=loadscope --no-loadscope-reorder
 DATASET_TESTS := tests/experiments/dataset
 
-.PHONY: demo test test-dataset test-slow lint format clean notebooks dataset-env benchmark-small \
+.PHONY: demo test test-dataset test-accelerator test-slow lint format clean notebooks dataset-env benchmark-small \
 	faults paper-table
 
 demo: $(READY)
@@ -41,6 +41,10 @@ test: $(READY)
 
 test-dataset: $(READY)
 	$(PYTEST) $(DATASET_TESTS)
+
+# What `accelerator_check` reports where there is none; a minute.
+test-accelerator: $(READY)
+	$(RUN) pytest -m slow tests/experiments/test_accelerator_check.py
 
 test-slow: $(READY)
 	$(RUN) pytest -m slow

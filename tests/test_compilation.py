@@ -187,13 +187,21 @@ def test_results_that_are_computed_at_once_keep_their_order():
 def test_an_accelerator_takes_one_after_the_other(monkeypatch):
     monkeypatch.setattr(compilation, "runs_on_cpu", lambda: False)
     threads = compilation.at_once(lambda _: threading.get_ident(), range(8))
-    assert len(set(threads)) == 1
+    assert set(threads) == {threading.get_ident()}
+
+
+def test_no_other_thread_computes_while_jax_traces():
+    numbers = (0.0, 1.0, 2.0)
+    slope = jax.grad(lambda x: sum(compilation.at_once(lambda y: x * y, numbers)))(2.0)
+    assert slope == 3.0
 
 
 def test_threads_have_the_settings_of_the_calling_one():
     def doubled(x):
         return jnp.asarray(x).dtype, (jnp.arange(2) * jnp.float32(0.5)).dtype
 
+    with jax.debug_nans(True), pytest.raises(FloatingPointError):
+        compilation.at_once(jnp.log, [jnp.full(2, -1.0)])
     with jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):
         assert compilation.at_once(doubled, [1.5]) == [(jnp.float64, jnp.float32)]
     with pytest.raises(ValueError, match="strict"):

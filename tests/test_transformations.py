@@ -383,6 +383,43 @@ def test_a_picture_has_no_gradient_of_the_scene_and_says_what_has():
         jax.grad(by_index)(1.5)
 
 
+def _image_of_params(x, model):
+    params = jax.tree.map(lambda y: x * y, model.params)
+    return render_image(model._replace(params=params), _ROW).linear
+
+
+_WITH_TRACERS = {
+    "scene": (lambda x, _: _image(_ROW, refref_jax.with_index(_GLASS, x)), "render_rays"),
+    "parameters": (_image_of_params, "render_rays"),
+    "surfaces": (
+        lambda x, _: (
+            images.find_first_surface(
+                _GLASS.surfaces._replace(normals=x * _GLASS.surfaces.normals), _ROW
+            ).distances
+        ),
+        "closest_hits",
+    ),
+    "radiance": (
+        lambda x, _: render_known(_GLASS, lambda *_: x * _AHEAD, _ROW, settings=_STRAIGHT).linear,
+        "shade",
+    ),
+}
+
+
+@pytest.mark.parametrize("transform", [jax.jit, jax.grad])
+@pytest.mark.parametrize("what", _WITH_TRACERS)
+def test_functions_of_the_host_refuse_a_tracer_wherever_it_is(what, transform):
+    (function, instead), model = _WITH_TRACERS[what], _model()
+    with pytest.raises(TypeError, match=f"tile by tile on the host.*{instead}"):
+        transform(lambda x: jnp.sum(function(x, model)))(1.0)
+
+
+def test_functions_of_the_host_are_refused_in_a_compiled_function_of_other_arrays():
+    model = _model()
+    with pytest.raises(TypeError, match=r"tile by tile on the host.*render_rays"):
+        jax.jit(lambda x: x * render_image(model, _ROW).linear)(1.0)
+
+
 @_cell("render_known", "in double precision", pytest.mark.slow)
 def _():
     with jax.enable_x64(True):

@@ -142,6 +142,9 @@ def render_known(
     tile = images.size_for(-(-rays.radii.size // _TILES), most=tile)
     # Transferred to the device once, not once per tile.
     scene, radiance = jax.device_put((scene, _as_argument(radiance)))
+    # What a function refers to is not among its leaves.
+    known = jax.make_jaxpr(radiance)(*np.zeros((2, 3), np.float32)).consts
+    numerics.refuse_tracers((scene, known), instead=_INSTEAD)
     render = functools.partial(_in_tiles, scene, radiance, tile=tile)
     if interior_list is not None or settings.max_bends == 0:
         return render(rays, interior_list, settings=settings)
@@ -167,7 +170,7 @@ def _in_tiles(
     def see(rays: Rays, interior_list: Int[np.ndarray, "rays slots"] | None, real: int) -> _Tile:
         seen, count = _render_tile(scene, radiance, rays, interior_list, settings=settings)
         # Each padding ray misses, which counts as one cast if rays are cast at all.
-        casts.append(int(images.fetch(count, instead=_INSTEAD)))
+        casts.append(int(numerics.fetch(count, instead=_INSTEAD)))
         casts.append((real - tile) * (settings.max_bends > 0))
         return seen
 

@@ -29,7 +29,7 @@ from refref_jax.geometry import cameras as pinholes
 from refref_jax.geometry.cameras import Cameras, box_filter, pixel_rays, supersample
 from refref_jax.geometry.rays import Rays
 from refref_jax.geometry.surfaces import LevelSet, Surfaces, closest, meet, surface_point
-from refref_jax.numerics import host_array
+from refref_jax.numerics import fetch, host_array, refuse_tracers
 from refref_jax.optics import light_paths, path_tracing
 from refref_jax.optics.light_paths import Branch
 from refref_jax.optics.media import EMPTY_SLOT, Scene
@@ -94,7 +94,7 @@ def in_tiles(
       interior_list: interior list of each ray's origin, if known.
 
     Raises:
-      TypeError: if an array is a tracer, see `fetch`.
+      TypeError: if an array is a tracer, see `numerics.refuse_tracers`.
     """
     rays, interior_list = fetch((rays, interior_list), instead=instead)
     shape, count = rays.radii.shape, rays.radii.size
@@ -152,24 +152,6 @@ def join(parts: Sequence[_Tree]) -> _Tree:
     return jax.tree.map(lambda *each: np.concatenate(each), *parts)
 
 
-def fetch(tree: _Tree, *, instead: str) -> _Tree:
-    """Converts all arrays of a pytree to NumPy arrays.
-
-    Args:
-      tree: pytree of numbers and arrays.
-      instead: advice at the end of the error message.
-
-    Raises:
-      TypeError: if an array is a tracer, because JAX transforms the calling function.
-    """
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree)):
-        raise TypeError(
-            "This function works tile by tile on the host and cannot be part of a function "
-            f"that jit, vmap or grad transforms. {instead}"
-        )
-    return jax.tree.map(np.asarray, jax.device_get(tree))
-
-
 def crop(
     rays: Rays, interior_list: Int[np.ndarray, "rays slots"] | None, start: int, tile: int
 ) -> tuple[Rays, Int[np.ndarray, "tile slots"] | None]:
@@ -219,6 +201,7 @@ def render_image(
     chunk = on_this_device(CHUNK) if chunk is None else chunk
     if chunk < 1:
         raise ValueError(f"chunk is {chunk}, but a chunk needs paths. Give 1 or more.")
+    refuse_tracers((model.params, model.scene), instead=_INSTEAD)
     rays = jax.tree.map(np.float32, fetch(rays, instead=_INSTEAD))
     nothing = jax.device_get(pixels.blank(jax.device_put(np.zeros((0, 3), np.float32))))
     if is_backdrop(model.config) and branch == "both":
@@ -268,8 +251,8 @@ def split_by_hit(
     surfaces: Surfaces | LevelSet, rays: Rays, *, tile: int | None = None, instead: str = _INSTEAD
 ) -> tuple[Bool[np.ndarray, "*rays"], Rays, Rays]:
     """Returns which rays meet an object, these rays and the others; `merged` joins their values."""
-    traced = [x for x in jax.tree.leaves(surfaces) if isinstance(x, jax.core.Tracer)]
-    rays, _ = fetch((rays, traced), instead=instead)
+    refuse_tracers(surfaces, instead=instead)
+    rays = fetch(rays, instead=instead)
     met = np.isfinite(find_first_surface(surfaces, rays, tile=tile).distances)
     return met, _select(rays, met), _select(rays, ~met)
 
@@ -460,6 +443,7 @@ def find_first_surface(
     tile = on_this_device(TILE) if tile is None else tile
     if tile < 1:
         raise ValueError(f"tile is {tile}, but a tile needs rays. Give 1 or more.")
+    refuse_tracers(surfaces, instead=_CAST_INSTEAD)
     surfaces = jax.device_put(surfaces)
     empty = np.zeros((0, 3), jax.dtypes.canonicalize_dtype(rays.radii.dtype))
     return in_tiles(

@@ -146,6 +146,9 @@ class _Problem(NamedTuple):
         Where all pixels are in memory, it stops when another round would gain hardly anything.
         """
         step, streams = int(state.step), self.share < 1.0
+        rounds = _reached(run, step)
+        if not streams and _expected_gain(rounds) < _WORTH:  # it was interrupted there
+            return
         with ThreadPoolExecutor(1) as beside:
             compiled = beside.submit(
                 backdrop_equations.warm_up, self._uniform(), self.surface["space"]
@@ -158,7 +161,6 @@ class _Problem(NamedTuple):
         def drawn(number: int) -> Sequence[Block]:
             return first.pop() if first else self.equations(number)
 
-        rounds = _reached(run, step)
         for reached in backdrop_solver.solve(
             drawn if streams else first.pop(),
             iterations=require(self.config.model.iterations),
@@ -271,6 +273,8 @@ def solve(
             if stop():
                 return step
     checkpoints.save(state._replace(step=jnp.asarray(total, jnp.int32)))
+    if step < total:
+        progress(total, total, f"{step} were enough: more would gain under {_WORTH:g} dB")
     if (learned := _solver_of(state).gains) is not None:
         gains = jax.device_get(jnp.exp(learned))
         run_folder.write_gains(run, problem.frames.names, gains)

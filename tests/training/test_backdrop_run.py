@@ -169,6 +169,8 @@ def test_a_paused_run_stops_where_one_without_a_pause_stops(scene, tmp_path):
     assert 3 * _ROUND <= whole < 20 * _ROUND
     assert train("paused", rounds=whole // _ROUND - 1) == whole - _ROUND
     assert train("paused") == whole
+    assert train("at its end", rounds=whole // _ROUND) == whole
+    assert train("at its end") == whole
 
 
 @pytest.mark.parametrize(
