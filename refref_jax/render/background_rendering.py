@@ -143,7 +143,7 @@ def render_known(
     # Transferred to the device once, not once per tile.
     scene, radiance = jax.device_put((scene, _as_argument(radiance)))
     # What a function refers to is not among its leaves.
-    known = jax.make_jaxpr(radiance)(*np.zeros((2, 3), np.float32)).consts
+    known = jax.make_jaxpr(radiance)(*np.zeros((2, 3), rays.directions.dtype)).consts
     numerics.refuse_tracers((scene, known), instead=_INSTEAD)
     render = functools.partial(_in_tiles, scene, radiance, tile=tile)
     if interior_list is not None or settings.max_bends == 0:
