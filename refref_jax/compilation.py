@@ -26,6 +26,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Literal, ParamSpec, TypeVar
 
 import jax
+import numpy as np
 from jax._src import config, core, xla_bridge
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import Primitive
@@ -64,6 +65,7 @@ field are a twelfth slower, and take `jax.jit`. Such a program cannot be a part 
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
+_Tree = TypeVar("_Tree")
 
 
 def native_loop(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
@@ -199,6 +201,31 @@ def at_once(function: Callable[..., _Result], *each: Sequence[Any]) -> list[_Res
 
     with ThreadPoolExecutor(2) as threads:
         return list(threads.map(with_settings, *each))
+
+
+def refuse_tracers(tree: Any, *, instead: str) -> None:
+    """Checks that a function that works on the host is not part of a transformed one.
+
+    Args:
+      tree: pytree of numbers and arrays.
+      instead: advice at the end of the error message.
+
+    Raises:
+      TypeError: if an array is a tracer, because JAX transforms the calling function, or if all new
+        arrays would be, because it compiles the function.
+    """
+    leaves = (*jax.tree.leaves(tree), jax.device_put(0.0))
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+        raise TypeError(
+            "This function works tile by tile on the host and cannot be part of a function "
+            f"that jit, vmap or grad transforms. {instead}"
+        )
+
+
+def fetch(tree: _Tree, *, instead: str) -> _Tree:
+    """Converts all arrays of a pytree to NumPy arrays; arguments and errors of `refuse_tracers`."""
+    refuse_tracers(tree, instead=instead)
+    return jax.tree.map(np.asarray, jax.device_get(tree))
 
 
 def add_missing_flag() -> None:

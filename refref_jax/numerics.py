@@ -10,14 +10,12 @@ so the *argument* of the singular function is replaced as well as its result.
 
 import functools
 import operator
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-
-_Tree = TypeVar("_Tree")
 
 # Direction components are clamped to at least this: a ray would have to travel 1e12 units before
 # the difference matters.
@@ -244,28 +242,3 @@ def host_array(values: np.ndarray | np.generic) -> Any:
     those of the functions that compute with them.
     """
     return values
-
-
-def refuse_tracers(tree: Any, *, instead: str) -> None:
-    """Checks that a function that works on the host is not part of a transformed one.
-
-    Args:
-      tree: pytree of numbers and arrays.
-      instead: advice at the end of the error message.
-
-    Raises:
-      TypeError: if an array is a tracer, because JAX transforms the calling function, or if all new
-        arrays would be, because it compiles the function.
-    """
-    leaves = (*jax.tree.leaves(tree), jax.device_put(0.0))
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
-        raise TypeError(
-            "This function works tile by tile on the host and cannot be part of a function "
-            f"that jit, vmap or grad transforms. {instead}"
-        )
-
-
-def fetch(tree: _Tree, *, instead: str) -> _Tree:
-    """Converts all arrays of a pytree to NumPy arrays; arguments and errors of `refuse_tracers`."""
-    refuse_tracers(tree, instead=instead)
-    return jax.tree.map(np.asarray, jax.device_get(tree))

@@ -320,8 +320,9 @@ class _Weights(nn.Module):
 
     @nn.compact
     def __call__(self) -> tuple[Float[Array, "inputs outputs"], Float[Array, " outputs"]]:
-        kernel = self.param("kernel", nn.initializers.lecun_normal(), (self.inputs, self.outputs))
-        return kernel, self.param("bias", nn.initializers.zeros_init(), (self.outputs,))
+        shape, kind = (self.inputs, self.outputs), jnp.float32
+        kernel = self.param("kernel", nn.initializers.lecun_normal(), shape, kind)
+        return kernel, self.param("bias", nn.initializers.zeros_init(), shape[1:], kind)
 
 
 _Layer = tuple[Float[Array, "_ _"], Float[Array, " _"]]

@@ -413,8 +413,8 @@ def of_channel(scene: Scene, channel: int) -> Scene:
     return scene._replace(interfaces=interfaces_of_channel(scene.interfaces, jnp.int32(channel)))
 
 
-def in_one_precision(scene: Scene, rays: Rays) -> tuple[Scene, Rays]:
-    """Converts a scene and rays to JAX arrays, all in the highest precision that one of them has.
+def in_one_precision(scene: _Tree, rays: Rays) -> tuple[_Tree, Rays]:
+    """Converts a scene, or its surfaces, and rays to arrays of the highest precision among them.
 
     Scenes are built in single precision, so rays in double precision are traced in double
     precision through corners that were rounded to single precision.

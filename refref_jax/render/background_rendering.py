@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax import numerics
 from refref_jax.choices import side_of
-from refref_jax.compilation import jit_quickly
+from refref_jax.compilation import fetch, jit_quickly, refuse_tracers
 from refref_jax.geometry import cameras as pinholes
 from refref_jax.geometry.cameras import Cameras
 from refref_jax.geometry.rays import Rays
@@ -144,7 +144,7 @@ def render_known(
     scene, radiance = jax.device_put((scene, _as_argument(radiance)))
     # What a function refers to is not among its leaves.
     known = jax.make_jaxpr(radiance)(*np.zeros((2, 3), rays.directions.dtype)).consts
-    numerics.refuse_tracers((scene, known), instead=_INSTEAD)
+    refuse_tracers((scene, known), instead=_INSTEAD)
     render = functools.partial(_in_tiles, scene, radiance, tile=tile)
     if interior_list is not None or settings.max_bends == 0:
         return render(rays, interior_list, settings=settings)
@@ -170,7 +170,7 @@ def _in_tiles(
     def see(rays: Rays, interior_list: Int[np.ndarray, "rays slots"] | None, real: int) -> _Tile:
         seen, count = _render_tile(scene, radiance, rays, interior_list, settings=settings)
         # Each padding ray misses, which counts as one cast if rays are cast at all.
-        casts.append(int(numerics.fetch(count, instead=_INSTEAD)))
+        casts.append(int(fetch(count, instead=_INSTEAD)))
         casts.append((real - tile) * (settings.max_bends > 0))
         return seen
 

@@ -23,16 +23,16 @@ from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax import numerics
 from refref_jax.choices import side_of
-from refref_jax.compilation import at_once, jit_quickly, runs_on_cpu
+from refref_jax.compilation import at_once, fetch, jit_quickly, refuse_tracers, runs_on_cpu
 from refref_jax.geometry import bvh
 from refref_jax.geometry import cameras as pinholes
 from refref_jax.geometry.cameras import Cameras, box_filter, pixel_rays, supersample
 from refref_jax.geometry.rays import Rays
 from refref_jax.geometry.surfaces import LevelSet, Surfaces, closest, meet, surface_point
-from refref_jax.numerics import fetch, host_array, refuse_tracers
+from refref_jax.numerics import host_array
 from refref_jax.optics import light_paths, path_tracing
 from refref_jax.optics.light_paths import Branch
-from refref_jax.optics.media import EMPTY_SLOT, Scene
+from refref_jax.optics.media import EMPTY_SLOT, Scene, in_one_precision
 from refref_jax.optics.path_settings import STRAIGHT, Detail, PathSettings
 from refref_jax.render import backdrop, learned_media, pixels
 from refref_jax.render.backdrop import Mips
@@ -59,6 +59,7 @@ _MOST_PARTS = 16  # that a tile is divided into, if its paths do not fit the buf
 _TIMES = 16
 
 NO_PART = -1
+
 _CAST_INSTEAD = "Call it outside, or cast single rays with bvh.closest_hits."
 _INSTEAD = "Call it outside, or use render_rays, which is a pure function."
 
@@ -94,7 +95,7 @@ def in_tiles(
       interior_list: interior list of each ray's origin, if known.
 
     Raises:
-      TypeError: if an array is a tracer, see `numerics.refuse_tracers`.
+      TypeError: if an array is a tracer, see `compilation.refuse_tracers`.
     """
     rays, interior_list = fetch((rays, interior_list), instead=instead)
     shape, count = rays.radii.shape, rays.radii.size
@@ -459,6 +460,7 @@ def find_first_surface(
 def _cast_tile(
     surfaces: Surfaces | LevelSet, rays: Rays
 ) -> tuple[Float[Array, " rays"], Float[Array, "rays 3"], Int[Array, " rays"]]:
+    surfaces, rays = in_one_precision(surfaces, rays)
     if isinstance(surfaces, LevelSet):
         return jax.vmap(_meet_level_set, in_axes=(None, 0))(surfaces, rays)
     limits = jnp.full_like(rays.radii, jnp.inf)
