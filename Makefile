@@ -28,8 +28,8 @@ PROCESSES = $(shell $(PYTHON) -c 'import os; print(min(5, 1 + (os.cpu_count() or
 PYTEST = $(RUN) pytest --numprocesses=$(PROCESSES) --dist=loadscope --no-loadscope-reorder
 DATASET_TESTS := tests/experiments/dataset
 
-.PHONY: demo test test-dataset test-accelerator test-slow lint format clean notebooks dataset-env benchmark-small \
-	faults paper-table
+.PHONY: demo test test-dataset test-accelerator test-slow lint format clean notebooks dataset-env \
+	benchmark-small faults paper-table
 
 demo: $(READY)
 	$(RUN) experiments.train --scene=experiments/data/cube_smcvx_ball --out=runs/demo --resume

@@ -274,7 +274,8 @@ def solve(
                 return step
     checkpoints.save(state._replace(step=jnp.asarray(total, jnp.int32)))
     if step < total:
-        progress(total, total, f"{step} were enough: more would gain under {_WORTH:g} dB")
+        why = f"another round would gain less than {_WORTH:g} dB"
+        progress(total, total, f"solved in {step} iterations: {why}")
     if (learned := _solver_of(state).gains) is not None:
         gains = jax.device_get(jnp.exp(learned))
         run_folder.write_gains(run, problem.frames.names, gains)

@@ -157,16 +157,20 @@ def test_a_paused_run_continues_to_the_same_bits(scene, run, tmp_path):
 @pytest.mark.slow
 def test_a_paused_run_stops_where_one_without_a_pause_stops(scene, tmp_path):
     config = _config(scene).override(iterations=20 * _ROUND, backdrop_resolution=16)
+    told = []
 
     def train(name, rounds=None):
         out, count = tmp_path / name, rounds and rounds * _ROUND
         stop = (lambda: len(run_folder.read_metrics(out)) == count) if count else lambda: False
         existing = "resume" if out.exists() else "refuse"
-        fit(config, out=out, existing=existing, stop=stop, report=lambda line: None)
+        progress = lambda step, total, text: told.append(text)
+        quiet = {"report": lambda line: None, "progress": progress}
+        fit(config, out=out, existing=existing, stop=stop, **quiet)
         return run_folder.read_metrics(out)[-1]["step"]
 
     whole = train("whole")
     assert 3 * _ROUND <= whole < 20 * _ROUND
+    assert told[-1].startswith(f"solved in {whole} iterations")
     assert train("paused", rounds=whole // _ROUND - 1) == whole - _ROUND
     assert train("paused") == whole
     assert train("at its end", rounds=whole // _ROUND) == whole
