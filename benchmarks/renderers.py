@@ -1,4 +1,4 @@
-"""Claim: in equal time, the refined tree has a higher masked PSNR than two other renderers.
+"""Claim: in equal time, the refined tree has a higher PSNR than two other renderers.
 
     PYTHONPATH=FOLDER_OF_MITSUBA python -m benchmarks.renderers --scenes=BALL,TORUS,FLASK \
         --out=FOLDER --blender=PYTHON_OF_BLENDER
@@ -26,6 +26,7 @@ if hasattr(os, "sched_setaffinity"):
 import contextlib
 import csv
 import dataclasses
+import itertools
 import json
 import shutil
 import subprocess
@@ -58,15 +59,21 @@ _SIZE = flags.DEFINE_integer("size", 100, "Width and height of the images in pix
 _TRUTH = flags.DEFINE_integer("truth", 4096, "Samples of the truth.")
 _ROUNDS = flags.DEFINE_integer("rounds", 2, "Timed renderings of every image.")
 
-_SAMPLES = (16, 64, 256, 1024)
+_SAMPLES = (4, 16, 64, 256, 1024)
 _UNIFORM = (1, 4, 9, 16)
 # First rays, refined rays, and tolerance.
 _ADAPTIVE = ((1, 4, 0.1), (1, 16, 0.1), (4, 16, 0.1), (4, 36, 0.1), (9, 64, 0.1))
+# Fields of the results, and their names in figures.
+_REGIONS = {"psnr_masked": "masked", "psnr_outside": "outside"}
 _FINE = dataclasses.replace(TREE, min_throughput=0.005, max_bends=32)
+_FINE_SIDE = 8
 _NOISE = "noise of the truth"
 _REFINED = "tree, refined"
-# The claim is about points with at least so many rays per pixel.
-_LEAST_RAYS = 4.0
+# The claim inside the mask is about images that are refined to more rays than this. Outside, it is
+# about those that begin with as many, up to this PSNR in dB: at the silhouettes of the flask the
+# three renderers differ by 0.7 to 1 %, with shading normals that face away from the camera.
+_LEAST_RAYS = 4
+_AGREED = 57.0
 _HERE = Path(__file__).parent
 _DATASET = _HERE.parent / "experiments" / "dataset"
 
@@ -81,7 +88,7 @@ class View(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """A row of the results."""
+    """A row of the results; of silhouettes, those pixels outside that objects cover in part."""
 
     scene: str
     renderer: str
@@ -92,6 +99,7 @@ class Measured(NamedTuple):
     psnr_masked: float
     psnr_outside: float
     psnr: float
+    rms_silhouettes: float
     dropped: float
 
 
@@ -174,10 +182,18 @@ class Ours:
         focal = cameras.focal_length(_SIZE.value, view.angle_x)
         return cameras.Cameras(pose, _SIZE.value, _SIZE.value, focal)
 
-    def mask(self, view: View) -> np.ndarray:
-        """Returns whether the ray through the centre of each pixel hits an object."""
-        rays = cameras.image_rays(self.camera(view), 0)
-        return np.isfinite(images.find_first_surface(self.scene.surfaces, rays).distances)
+    def masks(self, view: View) -> np.ndarray:
+        """Returns the pixels whose centre an object covers, and others that it covers in part."""
+        camera = self.camera(view)
+        inside, fine = (
+            np.isfinite(images.find_first_surface(self.scene.surfaces, rays).distances)
+            for rays in (
+                cameras.image_rays(camera, 0),
+                cameras.image_rays(cameras.supersample(camera, _FINE_SIDE), 0),
+            )
+        )
+        covered = cameras.box_filter(fine.astype(np.float32), _FINE_SIDE)
+        return np.stack([inside, ~inside & (covered > 0.0)])
 
     def __call__(self, view: View, choice: tuple) -> Rendered:
         """Renders a view with path settings, first and refined rays, and tolerance."""
@@ -293,7 +309,8 @@ def _measure(
                 print(error, "It is omitted.", flush=True)
                 ways = {other: way for other, way in ways.items() if other[0] != key[0]}
         turns.append(seen)
-    masks = [Ours(folder).mask(view) for view in views]
+    ours = Ours(folder)
+    masks = [ours.masks(view) for view in views]
     targets = [truth[view.name] for view in views]
     rows, name = [], folder.name.rsplit("_", 1)[-1]
     for key in ways:
@@ -306,7 +323,9 @@ def _measure(
         errors = _mean_errors(pairs, masks)
         rows.append(Measured(name, *key, count, float(np.mean(best)), start, *errors, dropped))
     # The mean of the halves has a quarter of the variance of their difference.
-    noise = _mean_errors(targets, masks) + 10.0 * np.log10(4.0)
+    noise = _mean_errors(targets, masks)
+    noise[:3] += 10.0 * np.log10(4.0)
+    noise[3] *= 0.5
     count = str(_TRUTH.value)
     rows.append(Measured(name, _NOISE, count, _TRUTH.value, np.nan, np.nan, *noise, 0.0))
     _side_by_side(folder, truth, views, turns[-1])
@@ -320,12 +339,13 @@ def _mean_errors(pairs: list, masks: list[np.ndarray]) -> np.ndarray:
     return np.mean([_errors(*pair, mask) for pair, mask in zip(pairs, masks, strict=True)], axis=0)
 
 
-def _errors(linear: np.ndarray, target: np.ndarray, mask: np.ndarray) -> tuple[float, ...]:
-    """Returns PSNR of clipped sRGB in dB: masked, outside, and of the image."""
+def _errors(linear: np.ndarray, target: np.ndarray, masks: np.ndarray) -> tuple[float, ...]:
+    """Returns PSNR of clipped sRGB in dB, masked, outside, and of the image; RMS of silhouettes."""
     pair = [colours.linear_to_srgb(np.clip(x, 0.0, 1.0)) for x in (linear, target)]
-    squares = (pair[0] - pair[1]) ** 2
+    squares, (mask, silhouettes) = (pair[0] - pair[1]) ** 2, masks
     parts = (squares[mask], squares[~mask], squares)
-    return tuple(-10.0 * np.log10(np.mean(part)) for part in parts)
+    psnr = (-10.0 * np.log10(np.mean(part)) for part in parts)
+    return (*psnr, float(np.sqrt(np.mean(squares[silhouettes]))))
 
 
 def _side_by_side(
@@ -355,7 +375,7 @@ def _write(file: Path, rows: list[Measured]) -> None:
 
 
 def _plot(file: Path, rows: list[Measured]) -> None:
-    """Draws masked PSNR over seconds for each scene."""
+    """Draws PSNR over seconds for each scene, inside the mask above, and outside below."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -363,42 +383,55 @@ def _plot(file: Path, rows: list[Measured]) -> None:
 
     scenes = list(dict.fromkeys(row.scene for row in rows))
     figure, axes = plt.subplots(
-        1, len(scenes), figsize=(4.2 * len(scenes), 4.0), squeeze=False, layout="constrained"
+        2, len(scenes), figsize=(4.2 * len(scenes), 7.0), squeeze=False, layout="constrained"
     )
-    for axis, scene in zip(axes[0], scenes, strict=True):
-        mine = [row for row in rows if row.scene == scene and np.isfinite(row.seconds)]
+    for (line, region), (column, scene) in itertools.product(
+        enumerate(_REGIONS), enumerate(scenes)
+    ):
+        axis, mine = axes[line, column], [row for row in rows if row.scene == scene]
+        mine = [row for row in mine if np.isfinite(row.seconds)]
         for name in dict.fromkeys(row.renderer for row in mine):
-            curve = sorted((r.seconds, r.psnr_masked) for r in mine if r.renderer == name)
+            curve = sorted((r.seconds, getattr(r, region)) for r in mine if r.renderer == name)
             axis.plot(*zip(*curve, strict=True), "o-", markersize=3, label=name)
-        axis.set(xscale="log", title=scene, xlabel="seconds per image", ylabel="masked PSNR, dB")
+        label = f"{_REGIONS[region]} PSNR, dB"
+        axis.set(xscale="log", title=scene, xlabel="seconds per image", ylabel=label)
         axis.grid(alpha=0.3)
-    axes[0][0].legend(fontsize=7)
+    axes[0, 0].legend(fontsize=7)
     figure.savefig(file, dpi=110)
 
 
-def _gain(ours: Measured, theirs: list[Measured]) -> float:
-    """Returns our masked PSNR minus that of another renderer in the same seconds, in dB.
+def _gain(ours: Measured, theirs: list[Measured], region: str) -> float:
+    """Returns our PSNR in a region minus that of another renderer in the same seconds, in dB.
 
     Its curve is interpolated over the logarithm of the seconds; where ours is faster than its first
     point, that point counts.
     """
     theirs = sorted(theirs, key=lambda row: row.seconds)
-    seconds, psnr = ([getattr(row, key) for row in theirs] for key in ("seconds", "psnr_masked"))
-    return ours.psnr_masked - float(np.interp(np.log(ours.seconds), np.log(seconds), psnr))
+    seconds, psnr = ([getattr(row, key) for row in theirs] for key in ("seconds", region))
+    return getattr(ours, region) - float(np.interp(np.log(ours.seconds), np.log(seconds), psnr))
 
 
 def _check(rows: list[Measured]) -> None:
     """Prints the gains of all points of the refined tree, and asserts the claim."""
     missed = []
-    for scene in dict.fromkeys(row.scene for row in rows):
-        here = [row for row in rows if row.scene == scene]
-        for mine in (row for row in here if row.renderer == _REFINED):
-            for name in ("Cycles", "Mitsuba"):
-                if theirs := [row for row in here if row.renderer == name]:
-                    gain = _gain(mine, theirs)
-                    print(f"{scene}, {mine.samples}, {mine.seconds:.3f} s: {gain:+.1f} dB, {name}")
-                    if mine.mean_samples >= _LEAST_RAYS and gain < 0.0:
-                        missed.append((scene, mine.samples, name))
+    for mine in (row for row in rows if row.renderer == _REFINED):
+        first, _, refined = mine.samples.split()
+        claimed = {
+            "masked": int(refined) > _LEAST_RAYS,
+            "outside": int(first) >= _LEAST_RAYS and mine.psnr_outside <= _AGREED,
+        }
+        for name in ("Cycles", "Mitsuba"):
+            theirs = [row for row in rows if (row.scene, row.renderer) == (mine.scene, name)]
+            if not theirs:
+                continue
+            gains = {label: _gain(mine, theirs, key) for key, label in _REGIONS.items()}
+            told = ", ".join(f"{label} {gain:+.1f} dB" for label, gain in gains.items())
+            print(f"{mine.scene}, {mine.samples}, {mine.seconds:.3f} s: {told}, {name}")
+            missed += [
+                (mine.scene, mine.samples, name, label)
+                for label, gain in gains.items()
+                if claimed[label] and gain < 0.0
+            ]
     assert not missed, missed
 
 

@@ -181,14 +181,29 @@ def runs_on_cpu() -> bool:
     return jax.default_backend() == "cpu"
 
 
-def at_once(function: Callable[..., _Result], *each: Sequence[Any]) -> list[_Result]:
-    """Returns the results of a function for corresponding elements, two at a time on CPUs.
+def is_transforming() -> bool:
+    """Returns whether JAX transforms the calling function, so that arrays may be tracers."""
+    return not core.trace_state_clean()
+
+
+def threads() -> int:
+    """Returns how many elements `at_once` works on at the same time: two, or one.
 
     One program does not keep two cores busy: parts of it have one thread, and nothing runs while
-    the host prepares its arguments. The threads get the settings that the calling one has by
-    context managers of JAX. On accelerators, and while JAX traces, there are no threads.
+    the host prepares its arguments. There is one thread on accelerators, where this process may use
+    a single core, and while JAX transforms the calling function.
     """
-    if not runs_on_cpu() or not core.trace_state_clean():
+    affinity = getattr(os, "sched_getaffinity", None)  # of Linux
+    cores = len(affinity(0)) if affinity else os.cpu_count() or 1
+    return 1 if is_transforming() or not runs_on_cpu() else min(2, cores)
+
+
+def at_once(function: Callable[..., _Result], *each: Sequence[Any]) -> list[_Result]:
+    """Returns the results of a function for corresponding elements, `threads()` at a time.
+
+    The threads get the settings that the calling one has by context managers of JAX.
+    """
+    if threads() == 1:
         return [function(*elements) for elements in zip(*each, strict=True)]
     states = config.config_states.values()
     changed = [(state, state.value) for state in states if state.value is not state.get_global()]
@@ -199,8 +214,8 @@ def at_once(function: Callable[..., _Result], *each: Sequence[Any]) -> list[_Res
                 stack.enter_context(state(value))
             return function(*elements)
 
-    with ThreadPoolExecutor(2) as threads:
-        return list(threads.map(with_settings, *each))
+    with ThreadPoolExecutor(threads()) as workers:
+        return list(workers.map(with_settings, *each))
 
 
 def refuse_tracers(tree: Any, *, instead: str) -> None:

@@ -128,6 +128,46 @@ def supersample(cameras: Cameras, side: int) -> Cameras:
     )
 
 
+def rays_of_pixels(
+    cameras: Cameras,
+    camera: int,
+    row: Int[np.ndarray, "*pixels"],
+    column: Int[np.ndarray, "*pixels"],
+    *,
+    side: int,
+) -> Rays:
+    """Returns several rays of each pixel, as `[*pixels, side * side]`, with their strata.
+
+    Every square of a pixel has one ray, and so have all `side * side` rows and columns of the
+    pixel: an edge along them is resolved by as many steps as there are rays.
+
+    Args:
+      cameras: the cameras.
+      camera: index of the camera.
+      row: row of each pixel, 0 at the top.
+      column: column of each pixel, 0 at the left.
+      side: square root of the number of rays in a pixel; their squares are numbered row by row.
+
+    Source: Kensler, Correlated Multi-Jittered Sampling (2013), the canonical arrangement, whose
+    offsets are taken in steps of about the golden section, ours.
+    """
+    down, along = (x.ravel() for x in np.indices((side, side)))
+    golden = 0.5 * (3.0 - math.sqrt(5.0)) * side
+    coprime = [step for step in range(1, side + 1) if math.gcd(step, side) == 1]
+    step = min(coprime, key=lambda step: abs(step - golden))
+    up, right = ((step * x % side + 0.5) / side - 0.5 for x in (along, down))
+    fine_row, fine_column = (
+        side * row[..., None] + down - up,
+        side * column[..., None] + along + right,
+    )
+    fine = supersample(cameras, side)
+    rays = pixel_rays(fine, np.full(fine_row.shape, camera), fine_row, fine_column)
+    pixel = np.broadcast_to((row * cameras.width + column)[..., None], fine_row.shape)
+    subpixel = np.broadcast_to(np.arange(side**2), fine_row.shape)
+    numbers = np.stack([pixel, subpixel, np.full(fine_row.shape, side**2)], axis=-1)
+    return rays._replace(strata=host_array(numbers.astype(np.int32)))
+
+
 def strata(cameras: Cameras, side: int) -> Int[np.ndarray, "height width 3"]:
     """Returns pixel, subpixel and number of subpixels of every ray of a supersampled camera.
 

@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax import numerics
 from refref_jax.choices import side_of
-from refref_jax.compilation import fetch, jit_quickly, refuse_tracers
+from refref_jax.compilation import fetch, is_transforming, jit_quickly, refuse_tracers, threads
 from refref_jax.geometry import cameras as pinholes
 from refref_jax.geometry.cameras import Cameras
 from refref_jax.geometry.rays import Rays
@@ -36,15 +36,15 @@ from refref_jax.render.backgrounds import Radiance
 TILE = 65536
 """Largest number of rays traced at once."""
 
-# Number of tiles of an image that is full of glass, if larger ones are allowed.
-_TILES = 4
-
 _INSTEAD = (
     "Call it outside, or use trace or follow_main_branches and shade, which are pure functions."
 )
 
 # Middles of the quadrants of a pixel, whose edges are root 3 times its ray differential.
 _QUADRANTS = np.sqrt(3.0) / 4.0 * np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)])
+
+# Largest number of rays for the background of a pixel that is refined to fewer.
+_MOST_STRAIGHT = 144
 
 # Number of paths whose radiance is evaluated at once.
 _CHUNK = 4096
@@ -75,7 +75,7 @@ class KnownImage(NamedTuple):
     Attributes:
       rgb: sRGB colours in `[0, 1]`.
       linear: linear RGB colours, not clipped.
-      rays: number of rays that each pixel is the mean of.
+      rays: number of rays that each pixel is the mean of, with those of the background alone.
       dropped: dropped throughput, as in `KnownRendering`, mean over those rays.
       casts: total number of closest-hit queries, with those of replaced rays.
     """
@@ -136,23 +136,34 @@ def render_known(
       >>> image.rgb.shape, image.casts
       ((4, 4, 3), 0)
     """
+    return _render(scene, radiance, rays, settings, interior_list, tile)[0]
+
+
+def _render(
+    scene: Scene,
+    radiance: Radiance,
+    rays: Rays,
+    settings: PathSettings,
+    interior_list: Int[np.ndarray, "*rays slots"] | None,
+    tile: int,
+) -> tuple[KnownRendering, Bool[np.ndarray, "*rays"]]:
+    """Returns what `render_known` does, and which rays meet an object, if they can bend."""
     if tile < 1:
         raise ValueError(f"tile is {tile}, but a tile needs rays. Give 1 or more.")
-    # A part of an image meets glass. All images of one size have the same tiles, and one program.
-    tile = images.size_for(-(-rays.radii.size // _TILES), most=tile)
-    # Transferred to the device once, not once per tile.
     scene, radiance = jax.device_put((scene, _as_argument(radiance)))
-    # What a function refers to is not among its leaves.
-    known = jax.make_jaxpr(radiance)(*np.zeros((2, 3), rays.directions.dtype)).consts
-    refuse_tracers((scene, known), instead=_INSTEAD)
+    refuse_tracers(scene, instead=_INSTEAD)
+    if is_transforming():  # what a function refers to is not among its leaves
+        known = jax.make_jaxpr(radiance)(*np.zeros((2, 3), rays.directions.dtype)).consts
+        refuse_tracers(known, instead=_INSTEAD)
     render = functools.partial(_in_tiles, scene, radiance, tile=tile)
     if interior_list is not None or settings.max_bends == 0:
-        return render(rays, interior_list, settings=settings)
+        met = np.full(rays.radii.shape, settings.max_bends > 0)
+        return render(rays, interior_list, settings=settings), met
     met, hits, misses = images.split_by_hit(scene.surfaces, rays, tile=tile, instead=_INSTEAD)
     bent, straight = render(hits, None, settings=settings), render(misses, None, settings=STRAIGHT)
     pairs = zip(bent[:-1], straight[:-1], strict=True)
     rgb, linear, paths, dropped = (images.merged(met, *each) for each in pairs)
-    return KnownRendering(rgb, linear, paths, dropped, bent.casts + misses.radii.size)
+    return KnownRendering(rgb, linear, paths, dropped, bent.casts + misses.radii.size), met
 
 
 def _in_tiles(
@@ -164,8 +175,8 @@ def _in_tiles(
     settings: PathSettings,
     tile: int,
 ) -> KnownRendering:
-    """Renders rays tile by tile; arguments as in `render_known`."""
-    casts = []
+    """Renders rays in as few tiles as keep all threads busy; arguments as in `render_known`."""
+    tile, casts = images.size_for(-(-rays.radii.size // threads()), most=tile), []
 
     def see(rays: Rays, interior_list: Int[np.ndarray, "rays slots"] | None, real: int) -> _Tile:
         seen, count = _render_tile(scene, radiance, rays, interior_list, settings=settings)
@@ -205,7 +216,9 @@ def render_known_camera(
     With `refined_rays_per_pixel`, a pixel is rendered again with that many rays, which replace the
     first ones, if one of its rays and the eight rays around it, some of them of the next pixels,
     differ by more than `tolerance`. So edges, silhouettes and places where glass shrinks the
-    background get many rays, and smooth places few.
+    background get many rays, and smooth places few. Where a refined pixel shows the background
+    past the objects, up to four times as many rays measure it and its share of the pixel: one that
+    is not bent costs a thirtieth of the others.
 
     Args:
       scene: the scene.
@@ -243,24 +256,29 @@ def render_known_camera(
     _check_refinement(rays_per_pixel, refined_rays_per_pixel, tolerance)
     scene, radiance = jax.device_put((scene, _as_argument(radiance)))
 
-    def see(row: np.ndarray, column: np.ndarray, count: int) -> KnownRendering:
-        rays = _rays_of_pixels(cameras, view, row, column, side_of(count))
+    def see(row: np.ndarray, column: np.ndarray, count: int) -> tuple[KnownRendering, np.ndarray]:
+        rays = pinholes.rays_of_pixels(cameras, view, row, column, side=side_of(count))
         listed = interior_list
         if listed is not None:
             listed = np.broadcast_to(listed, (*rays.radii.shape, *listed.shape))
-        return render_known(
-            scene, radiance, rays, settings=settings, interior_list=listed, tile=tile
-        )
+        return _render(scene, radiance, rays, settings, listed, tile)
 
     row, column = np.indices((cameras.height, cameras.width))
-    seen = see(row, column, rays_per_pixel)
+    seen, _ = see(row, column, rays_per_pixel)
     casts, rays = seen.casts, np.full(row.shape, rays_per_pixel, np.int32)
     linear, dropped = seen.linear.mean(axis=2), seen.dropped.mean(axis=2)
     if refined_rays_per_pixel is not None:
         again = _contrast(seen.rgb) > tolerance
-        finer = see(row[again], column[again], refined_rays_per_pixel)
+        finer, met = see(row[again], column[again], refined_rays_per_pixel)
         casts, rays[again] = casts + finer.casts, refined_rays_per_pixel
         linear[again], dropped[again] = finer.linear.mean(axis=1), finer.dropped.mean(axis=1)
+        many = max(refined_rays_per_pixel, min(4 * refined_rays_per_pixel, _MOST_STRAIGHT))
+        beside = ~met.all(axis=1) & (many > refined_rays_per_pixel)
+        again[again], known = beside, (finer.linear[beside], met[beside])
+        where = row[again], column[again]
+        straight = pinholes.rays_of_pixels(cameras, view, *where, side=side_of(many))
+        linear[again] = _with_more_background(scene, radiance, straight, *known, settings, tile)
+        casts, rays[again] = casts + straight.radii.size, many
     rgb = np.clip(np.asarray(pixels.linear_to_srgb(jax.device_put(linear))), 0.0, 1.0)
     return KnownImage(rgb, linear, rays, dropped, casts)
 
@@ -327,46 +345,45 @@ def _check_refinement(count: int, refined: int | None, tolerance: float) -> None
         )
 
 
-def _rays_of_pixels(
-    cameras: Cameras,
-    view: int,
-    row: Int[np.ndarray, "*pixels"],
-    column: Int[np.ndarray, "*pixels"],
-    side: int,
-) -> Rays:
-    """Returns the `side * side` rays of some pixels, as `[*pixels, rays]`, row by row.
-
-    Every square of a pixel has one ray, and so have all `side * side` rows and columns of the
-    pixel: an edge along them is resolved by as many steps as there are rays.
-
-    Source: Kensler, Correlated Multi-Jittered Sampling (2013), the canonical arrangement.
-    """
-    down, along = (x.ravel() for x in np.indices((side, side)))
-    lower, further = 0.5 - (along + 0.5) / side, (down + 0.5) / side - 0.5
-    fine_row = side * row[..., None] + down + lower
-    fine_column = side * column[..., None] + along + further
-    fine = pinholes.supersample(cameras, side)
-    rays = pinholes.pixel_rays(fine, np.full(fine_row.shape, view), fine_row, fine_column)
-    pixel = np.broadcast_to((row * cameras.width + column)[..., None], fine_row.shape)
-    subpixel = np.broadcast_to(np.arange(side**2), fine_row.shape)
-    strata = np.stack([pixel, subpixel, np.full(fine_row.shape, side**2)], axis=-1)
-    return rays._replace(strata=numerics.host_array(strata.astype(np.int32)))
-
-
 def _contrast(rgb: Float[np.ndarray, "h w rays 3"]) -> Float[np.ndarray, "h w"]:
     """Returns the largest range of any ray of a pixel and its neighbours, in any channel."""
     height, width, count, _ = rgb.shape
     side = side_of(count)
     fine = rgb.reshape(height, width, side, side, 3).swapaxes(1, 2)
     fine = np.pad(fine.reshape(side * height, side * width, 3), ((1, 1), (1, 1), (0, 0)), "edge")
-    high, low = fine, fine
-    for axis in (0, 1):
-        high, low = (
-            combine.reduce(np.lib.stride_tricks.sliding_window_view(x, 3, axis), axis=-1)
-            for combine, x in ((np.maximum, high), (np.minimum, low))
-        )
+    high, low = (
+        combine(combine(x[:-2], x[1:-1]), x[2:])
+        for combine, y in ((np.maximum, fine), (np.minimum, fine))
+        for x in [combine(combine(y[:, :-2], y[:, 1:-1]), y[:, 2:])]
+    )
     spread = np.max(high - low, axis=-1)
     return spread.reshape(height, side, width, side).max(axis=(1, 3))
+
+
+def _with_more_background(
+    scene: Scene,
+    radiance: Radiance,
+    rays: Rays,
+    seen: Float[np.ndarray, "pixels few 3"],
+    met: Bool[np.ndarray, "pixels few"],
+    settings: PathSettings,
+    tile: int,
+) -> Float[np.ndarray, "pixels 3"]:
+    """Returns the mean colour of pixels over many rays, of which only straight ones are rendered.
+
+    Of few rays the colours are known (`seen`), and which `met` an object. One of many that meets an
+    object has the mean colour of the few that did in its pixel, and is straight where none did.
+
+    Source: double sampling for stratification; Neyman, Contribution to the Theory of Sampling Human
+    Populations (1938).
+    """
+    colours = _in_tiles(scene, radiance, rays, None, settings=STRAIGHT, tile=tile).linear
+    if settings.max_bends > 0:
+        hits, _, _ = images.split_by_hit(scene.surfaces, rays, tile=tile, instead=_INSTEAD)
+        count = met.sum(axis=1, keepdims=True)
+        glass = np.sum(seen * met[..., None], axis=1) / np.maximum(1, count)
+        colours = np.where((hits & (count > 0))[..., None], glass[:, None], colours)
+    return colours.mean(axis=1)
 
 
 @functools.partial(jit_quickly, static_argnames="settings")

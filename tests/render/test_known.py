@@ -213,8 +213,13 @@ def _rays(side, view=0):
     """Returns the rays of an image: one in each square, row and column of a pixel."""
     fine = cameras.supersample(_CAMERA, side)
     row, column = np.indices((fine.height, fine.width))
-    up, right = (column % side + 0.5) / side - 0.5, (row % side + 0.5) / side - 0.5
+    column_of, row_of = (_STEPS.get(side, 1) * (x % side) % side for x in (column, row))
+    up, right = (column_of + 0.5) / side - 0.5, (row_of + 0.5) / side - 0.5
     return cameras.pixel_rays(fine, np.full(row.shape, view), row - up, column + right)
+
+
+# Step of the offsets of the rays of a pixel, by the square root of their number.
+_STEPS = {2: 1, 3: 1, 4: 1, 5: 2, 6: 1, 8: 3, 10: 3, 12: 5}
 
 
 def _uniform(scene, radiance, side, view=0):
@@ -258,28 +263,57 @@ def _stripes(origin, direction):
     return jnp.where(jnp.sin(4.0 * direction[2]) > 0.0, 0.9, 0.1) + 0.0 * origin
 
 
+def _by_pixel(values, side):
+    return values.reshape(12, side, 12, side, *values.shape[2:]).swapaxes(1, 2)
+
+
+def _with_more_background(scene, radiance, few, many):
+    """Returns refined pixels, and which of them show the background past the objects.
+
+    Of many rays those that meet an object have the mean colour of the few that do in their pixel.
+    """
+    met, hits = (
+        _by_pixel(
+            np.isfinite(images.find_first_surface(scene.surfaces, _rays(side)).distances), side
+        )
+        for side in (few, many)
+    )
+    traced = render_known(scene, radiance, _rays(few), settings=TREE, tile=_TILE).linear
+    straight = render_known(scene, radiance, _rays(many), settings=STRAIGHT, tile=_TILE).linear
+    traced, colours = _by_pixel(traced, few), _by_pixel(straight, many)
+    for pixel in zip(*np.nonzero(met.any(axis=(2, 3))), strict=True):
+        colours[pixel][hits[pixel]] = traced[pixel][met[pixel]].mean(axis=0)
+    beside = ~met.all(axis=(2, 3))
+    means = (x.mean(axis=(2, 3)) for x in (colours, traced))
+    return np.where(beside[..., None], *means), beside
+
+
 @pytest.mark.slow
 def test_pixels_whose_rays_differ_from_neighbours_get_more_rays(scene):
     seen = _image(scene, _stripes, refined_rays_per_pixel=25, tolerance=0.2)
     first = render_known(scene, _stripes, _rays(2), settings=TREE, tile=_TILE).rgb
     high, low = (f(first, (3, 3, 1), mode="nearest") for f in (maximum_filter, minimum_filter))
-    contrast = (high - low).reshape(12, 2, 12, 2, 3).max(axis=(1, 3, 4))
+    contrast = _by_pixel(high - low, 2).max(axis=(2, 3, 4))
+    refined, beside = _with_more_background(scene, _stripes, 5, 10)
+    expected = np.where(contrast > 0.2, np.where(beside, 100, 25), 4)
     clear = np.abs(contrast - 0.2) > 1e-5  # of rounding
-    np.testing.assert_array_equal((seen.rays == 25)[clear], (contrast > 0.2)[clear])
-    assert set(np.unique(seen.rays)) == {4, 25}
-    few, many = _uniform(scene, _stripes, 2)[0], _uniform(scene, _stripes, 5)[0]
-    expected = np.where(seen.rays[..., None] == 4, few, many)
-    np.testing.assert_allclose(seen.linear, expected, atol=1e-5)
+    np.testing.assert_array_equal(seen.rays[clear], expected[clear])
+    assert set(np.unique(seen.rays)) == {4, 25, 100}
+    few = _uniform(scene, _stripes, 2)[0]
+    linear = np.where(seen.rays[..., None] == 4, few, refined)
+    np.testing.assert_allclose(seen.linear, linear, atol=1e-5)
 
 
 @pytest.mark.slow
 def test_refined_pixels_are_nearer_to_the_truth_than_more_rays_everywhere(scene):
     truth, _ = _uniform(scene, _stripes, 24)
     seen = _image(scene, _stripes, refined_rays_per_pixel=36, tolerance=0.2)
-    traced = np.mean(seen.rays + 4.0 * (seen.rays > 4))
-    assert traced < 25.0
+    met = np.isfinite(images.find_first_surface(scene.surfaces, _rays(6)).distances)
+    inside = met.reshape(12, 6, 12, 6).all(axis=(1, 3))
+    traced = seen.rays + 4.0 * (seen.rays > 4)
+    assert np.mean(traced[inside]) < 25.0
     error, uniform = (
-        np.sqrt(np.mean((x - truth) ** 2)) for x in (seen.linear, _uniform(scene, _stripes, 5)[0])
+        np.sqrt(np.mean((x - truth) ** 2)) for x in (seen.linear, _uniform(scene, _stripes, 6)[0])
     )
     assert error < uniform
 
@@ -287,8 +321,17 @@ def test_refined_pixels_are_nearer_to_the_truth_than_more_rays_everywhere(scene)
 def test_white_is_not_refined_and_zero_tolerance_refines_what_differs(scene):
     assert np.all(_image(scene, _WHITE, refined_rays_per_pixel=9).rays == 4)
     seen = _image(scene, _environment(), refined_rays_per_pixel=9, tolerance=0.0)
-    assert np.all(seen.rays == 9)
-    np.testing.assert_allclose(seen.linear, _uniform(scene, _environment(), 3)[0], atol=1e-5)
+    expected, beside = _with_more_background(scene, _environment(), 3, 6)
+    np.testing.assert_array_equal(seen.rays, np.where(beside, 36, 9))
+    np.testing.assert_allclose(seen.linear, expected, atol=1e-5)
+
+
+def test_straight_rays_are_refined_as_their_background(scene):
+    options = {"settings": STRAIGHT, "refined_rays_per_pixel": 100, "tolerance": 0.0}
+    seen = render_known_camera(scene, _environment(), _CAMERA, 0, tile=_TILE, **options)
+    fine = render_known(scene, _environment(), _rays(12), settings=STRAIGHT, tile=_TILE)
+    assert np.all(seen.rays == 144)
+    np.testing.assert_allclose(seen.linear, cameras.box_filter(fine.linear, 12), atol=1e-5)
 
 
 def test_a_tile_whose_paths_do_not_fit_is_rendered_in_halves(scene, rays):
