@@ -4,6 +4,7 @@ Programs are lowered for CUDA and TPU by JAX alone. Compiling for an H100 needs 
 ptxas of CUDA; its counts are compared with those that `benchmarks.compiled_programs` recorded.
 """
 
+import functools
 import json
 import re
 
@@ -12,15 +13,20 @@ import pytest
 from benchmarks.ahead_of_time import compile as ahead_of_time
 from benchmarks.ahead_of_time import counters, hopper, programs
 
-_PLATFORMS = ("cuda", "tpu")
+_each_platform = pytest.mark.parametrize(
+    "platform", ["cuda", pytest.param("tpu", marks=pytest.mark.slow)]
+)
 
 
 def _lowered(program):
+    """Returns what gives the program's text for a platform, which it is lowered for once."""
     traced = program.trace()
-    return {
-        platform: traced.lower(lowering_platforms=(platform,)).as_text(debug_info=True)
-        for platform in _PLATFORMS
-    }
+
+    @functools.cache
+    def text(platform):
+        return traced.lower(lowering_platforms=(platform,)).as_text(debug_info=True)
+
+    return text
 
 
 @pytest.fixture(scope="session")
@@ -51,24 +57,24 @@ def _dots(text):
     ]
 
 
-@pytest.mark.parametrize("platform", _PLATFORMS)
+@_each_platform
 def test_tracing_has_no_product_that_a_device_would_round(training, platform):
-    text = training[0][platform]
+    text = training[0](platform)
     assert not _refused(text) and not _dots(text)
 
 
-@pytest.mark.parametrize("platform", _PLATFORMS)
+@_each_platform
 def test_products_of_a_step_are_those_of_networks_or_have_all_digits(training, platform):
-    text = training[1][platform]
+    text = training[1](platform)
     assert not _refused(text)
     found = _dots(text)
     assert any("Dense_" in name for name, _ in found)
     assert [name for name, pinned in found if "Dense_" not in name and pinned != 2] == []
 
 
-@pytest.mark.parametrize("platform", _PLATFORMS)
+@_each_platform
 def test_products_of_the_solver_of_backdrops_have_all_digits(platform):
-    text = _lowered(programs.backdrop_product())[platform]
+    text = _lowered(programs.backdrop_product())(platform)
     assert not _refused(text)
     assert [name for name, pinned in _dots(text) if pinned != 2] == []
 
@@ -76,7 +82,7 @@ def test_products_of_the_solver_of_backdrops_have_all_digits(platform):
 def test_off_cpus_all_rays_of_a_pool_are_one_block(of_tiny, training):
     _, rays = of_tiny[0].arguments
     pool = f"tensor<{rays.radii.size}x3xf32>"
-    loops = [line for line in training[0]["cuda"].splitlines() if "stablehlo.while" in line]
+    loops = [line for line in training[0]("cuda").splitlines() if "stablehlo.while" in line]
     assert any(pool in line for line in loops) and not any("<1024x3xf32>" in x for x in loops)
 
 

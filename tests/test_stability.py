@@ -9,7 +9,15 @@ from benchmarks.stability.measures import MEASURES
 pytestmark = pytest.mark.longest
 
 
-_SLOW = ("ball, float64", "slabs of all ratios and angles, float64")
+# In double precision, and what `tests/geometry/test_hit_robustness.py` has of single hits.
+_SLOW = (
+    "ball, float64",
+    "slabs of all ratios and angles, float64",
+    "offsets 1 to 1e4",
+    "triangles of aspect 1e4 to 1e6",
+    "spheres of 80 triangles and more",
+    "in faces and along edges",
+)
 
 
 def _case(measure):

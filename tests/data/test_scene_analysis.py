@@ -310,6 +310,7 @@ def test_a_scene_that_states_no_size_gets_that_of_its_images(tmp_path):
     (scene / "scene.json").write_text(json.dumps(properties))
     for path in scene.glob("transforms_*.json"):
         content = json.loads(path.read_text())
+        content["frames"] = content["frames"][:24]
         for frame in content["frames"]:
             del frame["depth_file_path"]
         path.write_text(json.dumps(content))

@@ -325,6 +325,7 @@ def test_only_the_field_of_a_place_learns_there():
     assert size(beyond.surface) == 0.0 and size(beyond.around) > 0.0
 
 
+@pytest.mark.slow
 def test_beyond_the_ball_it_is_zipnerf():
     params = _trained(_NEUS)
     shape = zipnerf.RadianceFieldConfig(

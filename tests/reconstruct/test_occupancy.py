@@ -53,7 +53,8 @@ def _fitted():
 def test_an_untrained_field_is_a_ball():
     params = _initial()
     points = jax.random.uniform(jax.random.key(1), (50, 3))
-    found = jax.vmap(functools.partial(occupancy_field.signed, params, _FIELD))(points)
+    signed = jax.vmap(occupancy_field.signed, in_axes=(None, None, 0))
+    found = jax.jit(signed, static_argnums=1)(params, _FIELD, points)
     expected = np.linalg.norm(np.asarray(points) - 0.5, axis=1) - 0.4
     np.testing.assert_allclose(found, expected, atol=1e-6)
 
@@ -61,17 +62,22 @@ def test_an_untrained_field_is_a_ball():
 def test_the_slope_of_a_ball_points_outwards():
     params = _initial()
     at = jnp.asarray([0.8, 0.5, 0.9])
+    slope_at = jax.jit(occupancy_field.slope, static_argnums=1, static_argnames="step")
     for step in (0.02, 0.002):
-        slope = occupancy_field.slope(params, _FIELD, at, step=step)
+        slope = slope_at(params, _FIELD, at, step=step)
         # The sphere's second derivative there is at most 2.
         np.testing.assert_allclose(slope, [0.6, 0.0, 0.8], atol=2.0 * step)
 
 
+@jax.jit
+@functools.partial(jax.grad, argnums=(0, 1))
+def _slopes(params, at):
+    return occupancy_field.signed(params, _FIELD, at)
+
+
 @pytest.mark.parametrize("at", [(0.5, 0.5, 0.5), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)])
 def test_gradients_of_the_field_are_finite_in_the_middle_and_at_corners(at):
-    params = _initial()
-    by_all = jax.grad(lambda params, at: occupancy_field.signed(params, _FIELD, at), argnums=(0, 1))
-    assert gradients.all_finite(by_all(params, jnp.asarray(at)))
+    assert gradients.all_finite(_slopes(_initial(), jnp.asarray(at)))
 
 
 def test_configurations_that_make_no_sense_are_refused():

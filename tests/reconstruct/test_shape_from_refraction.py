@@ -350,7 +350,7 @@ def test_the_index_is_found_from_a_wrong_start(world, ball, true):
     assert told[-1] == (most, most)
 
 
-def test_a_ball_that_is_a_little_off_returns(world, seen):
+def test_a_ball_that_is_a_little_off_returns(world):
     off = Sphere(np.array([0.01, -0.006, 0.008]), 1.01)
     model = SingleObject(off, 1.48)
     steps = []
@@ -358,7 +358,7 @@ def test_a_ball_that_is_a_little_off_returns(world, seen):
         model,
         model.start(),
         world,
-        seen,
+        _photographs(world, 4),
         settings=Steps(blurs=(1, 0, 0, 0, 0)),
         progress=lambda number, facts: steps.append((number, facts)),
     )

@@ -50,13 +50,19 @@ _KINDS = {
 
 # Every run of the suite does both kinds, and two spaces.
 _OFTEN = [("raydef", "bounded"), ("raydef_polyline", "unbounded")]
-_each_kind_and_space = pytest.mark.parametrize(
-    ("kind", "space"),
-    [
-        pytest.param(*pair, marks=() if pair in _OFTEN else pytest.mark.slow)
-        for pair in itertools.product(_KINDS, _SPACES)
-    ],
-)
+
+
+def _cases(often):
+    return pytest.mark.parametrize(
+        ("kind", "space"),
+        [
+            pytest.param(*pair, marks=() if pair in often else pytest.mark.slow)
+            for pair in itertools.product(_KINDS, _SPACES)
+        ],
+    )
+
+
+_each_kind_and_space = _cases(_OFTEN)
 
 
 def _config(kind, space="bounded", **changes):
@@ -256,7 +262,7 @@ def _slopes_of_colours(params, config, path):
     return jnp.sum(_seen(config, params, path).composite.rgb)
 
 
-@_each_kind_and_space
+@_cases(_OFTEN[1:])
 def test_colours_train_the_deformation(kind, space):
     config = _config(kind, space)
     slopes = _slopes_of_colours(_trained(config), config, _path())

@@ -342,7 +342,7 @@ def test_a_tile_whose_paths_do_not_fit_is_rendered_in_halves(scene, rays):
     assert np.sum(once.dropped) > 0.0
     seen = render_known(scene, _environment(), hits, settings=scarce, tile=1024)
     assert np.sum(seen.dropped) == 0.0
-    roomy = render_known(scene, _environment(), hits, settings=TREE, tile=1024)
+    roomy = render_known(scene, _environment(), hits, settings=TREE, tile=256)
     np.testing.assert_allclose(seen.linear, roomy.linear, atol=1e-5)
 
 

@@ -109,7 +109,10 @@ def _painted(config, fog):
 
 @pytest.mark.parametrize("multisamples", [pytest.param(1, marks=pytest.mark.slow), 6])
 @pytest.mark.parametrize("offset", [-0.4, 0.0, 0.3])
-@pytest.mark.parametrize(("space", "order"), [("bounded", np.inf), ("spherical", 2)])
+@pytest.mark.parametrize(
+    ("space", "order"),
+    [("bounded", np.inf), pytest.param("spherical", 2, marks=pytest.mark.slow)],
+)
 def test_a_painted_wall_is_seen_exactly(monkeypatch, space, order, offset, multisamples):
     config = dataclasses.replace(_END, space=space, multisamples=multisamples, samples=2)
     wall = _in_unit_cube(_exit(_bent(), order)[0])
@@ -138,7 +141,7 @@ def _distances(monkeypatch, config, path, *, fog=0.0):
     return np.array([seen.median[0], seen.mean[0]])
 
 
-@pytest.mark.parametrize("samples", [2, 5])
+@pytest.mark.parametrize("samples", [pytest.param(2, marks=pytest.mark.slow), 5])
 @pytest.mark.parametrize(("space", "order"), [("bounded", np.inf), ("spherical", 2)])
 def test_a_wall_is_as_far_as_the_end_of_the_path(monkeypatch, space, order, samples):
     config = dataclasses.replace(_END, space=space, samples=samples)

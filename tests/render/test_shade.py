@@ -80,6 +80,7 @@ def test_a_radiance_function_gives_three_numbers(wrong):
         shade(_paths(), wrong, rays=2)
 
 
+@pytest.mark.slow
 def test_it_sees_what_a_picture_shows():
     glass = scenes.build(scenes.ball(1.3, subdivisions=2))
     rays = image_rays(orbit(1, distance=4.0, elevation=0.3, size=8, angle_x=0.8), 0)

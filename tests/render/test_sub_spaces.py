@@ -217,6 +217,7 @@ def test_values_and_gradients_are_finite_for_any_densities(raw, size):
     np.testing.assert_allclose(np.sum(seen.histograms[-1].weights), 1.0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_without_density_a_path_shows_the_wall_behind():
     """Sub-spaces without density, and those that are opaque at the start, by closed forms."""
     config = dataclasses.replace(_CONFIG, last_sample="end")

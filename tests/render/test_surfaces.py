@@ -68,6 +68,7 @@ def _seen(config, params, path=None, progress=None, anneal=0.0):
     return _radiance(params, config, path, jitter, jnp.float32(anneal), progress=progress)
 
 
+@pytest.mark.slow
 def test_the_distance_of_an_untrained_field_is_that_of_its_ball():
     """The ball has half the radius of the ball of radius 3 around the origin."""
     assert ball_of(_CONFIG) == ((0.0, 0.0, 0.0), 3.0)

@@ -449,6 +449,7 @@ _each_space = pytest.mark.parametrize(
 )
 
 
+@pytest.mark.slow
 @_each_space
 def test_a_model_that_is_moved_with_its_paths_gives_the_same(space):
     centre = np.array([4.0, -2.0, 8.0], np.float32)

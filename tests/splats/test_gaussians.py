@@ -119,6 +119,7 @@ def test_projection_by_hand():
     np.testing.assert_allclose(thinner.opacities, [0.769231, 0.651208, 0.667210], atol=2e-6)
 
 
+@pytest.mark.slow
 def test_projection_is_that_of_matrices():
     values, view = made_splats.gaussians(40), made_splats.view()
     found = jax.device_get(_projected(values, view))

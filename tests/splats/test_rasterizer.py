@@ -122,6 +122,7 @@ def test_the_derivatives_are_those_of_a_plain_blend(form, scene):
     assert not np.any(slopes.depths) and not np.any(slopes.radii)
 
 
+@_often("native")
 def test_the_derivatives_of_gaussians_are_those_of_float64(form, scene):
     """From the reference's derivatives of the features, through the projection in float64."""
     values, view, _, visible, exact, (image, left, visits) = scene
@@ -228,7 +229,7 @@ def test_the_order_of_gaussians_does_not_matter(form, scene):
         np.testing.assert_allclose(first, second, atol=1e-6)
 
 
-@_often("native")
+@pytest.mark.slow
 def test_moving_scene_and_camera_together_changes_nothing(form):
     """Quaternions are multiplied by that of the motion; colours without harmonics."""
     values, view = made_splats.gaussians(100), made_splats.view()
@@ -328,6 +329,7 @@ def test_a_list_longer_than_a_chunk(form):
     assert 1e-4 < float(left(thick)[1].transmittance[8, 8]) < 1e-2
 
 
+@_often("native")
 def test_opaque_gaussians_keep_a_thousandth_and_have_finite_derivatives(form):
     values = made_splats.joined(
         made_splats.one((0, 0, 2), scale=50, opacity=1.0),

@@ -60,7 +60,9 @@ _CASES = {
 
 _begin = jax.jit(optimizer(_SCHEDULE, small_model.MODEL).init)
 
-_each_precision = pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+_each_precision = pytest.mark.parametrize(
+    "precision", [pytest.param("float32", marks=pytest.mark.slow), "bfloat16"]
+)
 
 # A step takes seconds to compile: every run of the suite does the richest, and one in bfloat16.
 _OFTEN = [("absorbing", "float32")]

@@ -18,7 +18,9 @@ from refref_jax.sampling.scene_bounds import Domain
 from tests.factories import small_model
 
 _SIDE = 16
-_SPACES = ("bounded", "spherical", "unbounded")
+_each_space = pytest.mark.parametrize(
+    "space", ["bounded", pytest.param("spherical", marks=pytest.mark.slow), "unbounded"]
+)
 
 
 def _model(space):
@@ -69,7 +71,7 @@ def _bilinear(image, uv):
     return (1.0 - down) * above + down * below
 
 
-@pytest.mark.parametrize("space", _SPACES)
+@_each_space
 def test_rays_into_the_textured_mesh_see_the_backdrop(space, tmp_path):
     model, domain = _model(space), Domain(2.0, space, (0.1, -0.2, 0.3))
     path = tmp_path / "room.glb"
@@ -92,7 +94,7 @@ def test_rays_into_the_textured_mesh_see_the_backdrop(space, tmp_path):
     assert np.mean(np.abs(seen - expected)) < 0.006
 
 
-@pytest.mark.parametrize("space", _SPACES)
+@_each_space
 def test_a_panorama_looks_along_x_with_y_to_the_left(space):
     model, domain = _model(space), Domain(2.0, space, (0.1, -0.2, 0.3))
     image = backdrop_surface.panorama(model, height=64)

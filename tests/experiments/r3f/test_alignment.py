@@ -179,10 +179,12 @@ def test_creases_of_an_open_mesh_are_refused():
         fit_placement(_placed(mesh), Outlines(views, creased=True))
 
 
-def test_an_object_that_is_elsewhere_is_refused(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    "wrong", [{"shift": (30.0, 0.0, 0.0)}, pytest.param({"size": 0.02}, marks=pytest.mark.slow)]
+)
+def test_an_object_that_is_elsewhere_is_refused(tmp_path, monkeypatch, wrong):
     scene = write_scene(tmp_path / "cube_smcvx_ball", size=64)
     monkeypatch.setattr(index_stage, "learn_backdrop", None)  # would raise
-    for wrong in ({"shift": (30.0, 0.0, 0.0)}, {"size": 0.02}):
-        parts = [_perturbed(part, **wrong) for part in meshes.read_meshes(scene)]
-        with pytest.raises(ValueError, match="The object cannot be aligned"):
-            alignment.align(scene, parts, tmp_path, _OWN, seed=0)
+    parts = [_perturbed(part, **wrong) for part in meshes.read_meshes(scene)]
+    with pytest.raises(ValueError, match="The object cannot be aligned"):
+        alignment.align(scene, parts, tmp_path, _OWN, seed=0)

@@ -40,7 +40,7 @@ from tests.factories import bodies, scenes, vessels
 from tests.factories.silhouettes import RADIUS, without_masks, write_scene
 from tests.factories.small_scenes import write_grey
 
-pytestmark = [pytest.mark.longest, pytest.mark.computing]
+pytestmark = pytest.mark.longest
 
 _CONFIG = ReconstructionConfig("hull", 20, 0, 1.5, None, None, "none", 0)
 
@@ -55,7 +55,7 @@ def whole(scene, tmp_path_factory):
     """A reconstruction that nothing interrupted, compared with the truth."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(report, "compare_meshes", functools.partial(compare_meshes, samples=2000))
-        patch.setattr(report, "_HEIGHT", 80)
+        patch.setattr(report, "_HEIGHT", 40)
         out = tmp_path_factory.mktemp("whole") / "out"
         _run(scene, out)
     return out

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from experiments.r3f import chain, records
+from experiments.r3f import chain, records, report
 from experiments.r3f.records import ReconstructionConfig
 from tests.factories.silhouettes import write_scene
 from tests.processes.command import ROOT, run_command
@@ -22,7 +22,7 @@ _MASKS = (_GRID, "--refinement=none")
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     """A scene whose mesh cannot be read."""
-    scene = write_scene(tmp_path_factory.mktemp("scenes") / "cube_smcvx_ball")
+    scene = write_scene(tmp_path_factory.mktemp("scenes") / "cube_smcvx_ball", views=8)
     (scene / "meshes" / "ball_glass.ply").write_bytes(b"broken")
     return scene
 
@@ -32,7 +32,9 @@ def made(scene, tmp_path_factory):
     """A reconstruction of it."""
     out = tmp_path_factory.mktemp("made") / "r3f"
     config = ReconstructionConfig("hull", 20, 0, 1.45, None, None, "none", 0)
-    chain.reconstruct(scene, out, config, compare=False, say=lambda text: None)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(report, "_HEIGHT", 40)  # as in `print_beginnings`
+        chain.reconstruct(scene, out, config, compare=False, say=lambda text: None)
     return out
 
 
