@@ -268,17 +268,19 @@ def render_known_camera(
     casts, rays = seen.casts, np.full(row.shape, rays_per_pixel, np.int32)
     linear, dropped = seen.linear.mean(axis=2), seen.dropped.mean(axis=2)
     if refined_rays_per_pixel is not None:
-        again = _contrast(seen.rgb) > tolerance
-        finer, met = see(row[again], column[again], refined_rays_per_pixel)
-        casts, rays[again] = casts + finer.casts, refined_rays_per_pixel
-        linear[again], dropped[again] = finer.linear.mean(axis=1), finer.dropped.mean(axis=1)
         many = max(refined_rays_per_pixel, min(4 * refined_rays_per_pixel, _MOST_STRAIGHT))
-        beside = ~met.all(axis=1) & (many > refined_rays_per_pixel)
-        again[again], known = beside, (finer.linear[beside], met[beside])
-        where = row[again], column[again]
-        straight = pinholes.rays_of_pixels(cameras, view, *where, side=side_of(many))
-        linear[again] = _with_more_background(scene, radiance, straight, *known, settings, tile)
-        casts, rays[again] = casts + straight.radii.size, many
+        again = np.nonzero(_contrast(seen.rgb) > tolerance)
+        band = max(1, images.RAYS_OF_A_BAND // many)
+        for start in range(0, again[0].size, band):
+            here = again[0][start : start + band], again[1][start : start + band]
+            finer, met = see(*here, refined_rays_per_pixel)
+            casts, rays[here] = casts + finer.casts, refined_rays_per_pixel
+            linear[here], dropped[here] = finer.linear.mean(axis=1), finer.dropped.mean(axis=1)
+            beside = ~met.all(axis=1) & (many > refined_rays_per_pixel)
+            here, known = (here[0][beside], here[1][beside]), (finer.linear[beside], met[beside])
+            straight = pinholes.rays_of_pixels(cameras, view, *here, side=side_of(many))
+            linear[here] = _with_more_background(scene, radiance, straight, *known, settings, tile)
+            casts, rays[here] = casts + straight.radii.size, many
     rgb = np.clip(np.asarray(pixels.linear_to_srgb(jax.device_put(linear))), 0.0, 1.0)
     return KnownImage(rgb, linear, rays, dropped, casts)
 

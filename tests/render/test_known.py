@@ -372,3 +372,12 @@ def test_a_camera_inside_an_object_has_its_interior_list():
     )
     expected = cameras.box_filter(cameras.image_rays(cameras.supersample(here, 2), 0).directions, 2)
     np.testing.assert_allclose(seen.linear, expected + 2.0, atol=0.05)
+
+
+def test_few_rays_at_once_make_the_same_image(scene, monkeypatch):
+    whole = _image(scene, _stripes, refined_rays_per_pixel=9)
+    monkeypatch.setattr(images, "RAYS_OF_A_BAND", 500)
+    bands = _image(scene, _stripes, refined_rays_per_pixel=9)
+    np.testing.assert_array_equal(bands.rays, whole.rays)
+    np.testing.assert_allclose(bands.linear, whole.linear, atol=1e-6)
+    assert bands.casts == whole.casts
