@@ -21,6 +21,10 @@ AXIS = "devices"
 # Timeout for a process that does not answer, seconds.
 _PATIENCE = 100
 
+# Fewest bytes that a step takes for each sample of a path: a fifth of what the leanest preset takes
+# on a CPU, four fifths on a GPU (benchmarks/results/compiled_programs.csv).
+_LEAST_BYTES = 200
+
 
 def connect(*, coordinator: str, processes: int, process: int) -> None:
     """Connects this process to others that train together; must be called before devices are used.
@@ -74,6 +78,25 @@ def free_memory() -> int | None:
             if limit != resource.RLIM_INFINITY:
                 found.append(limit - own[used])
     return max(0, min(found))
+
+
+def check_memory(batch: int, samples: int) -> None:
+    """Refuses steps that cannot fit into memory, before they are compiled.
+
+    Args:
+      batch: number of rays of a step.
+      samples: number of samples of a step on one device.
+
+    Raises:
+      ValueError: if a lower bound of what they take is more than there is.
+    """
+    free, least = free_memory(), samples * _LEAST_BYTES
+    if free is not None and least > free:
+        raise ValueError(
+            f"A step of batch={batch} rays takes at least {least / 2**30:.1f} GiB, but "
+            f"{free / 2**30:.1f} GiB of memory are free. Lower batch to "
+            f"{max(1, batch * free // least)} or less, or samples_per_ray."
+        )
 
 
 def _read_sizes(path: str) -> dict[str, int]:

@@ -320,11 +320,6 @@ def _progress(
     return step.astype(jnp.float32) / require(config.schedule.steps)
 
 
-# Fewest bytes that a step takes for each sample of a path: a fifth of what the leanest preset takes
-# on a CPU, four fifths on a GPU (benchmarks/results/compiled_programs.csv).
-_LEAST_BYTES = 200
-
-
 class Setup(NamedTuple):
     """The constant part of a run.
 
@@ -380,30 +375,11 @@ def set_up(
     )
     samples = model.samples + sum(each.samples for each in model.proposals)
     rendered = capacity * samples // (1 if mesh is None else mesh.size)
-    devices.in_all(lambda: _check_memory(batch, rendered))
+    devices.in_all(lambda: devices.check_memory(batch, rendered))
     hit_fraction = float(found.hit_fraction)
     scene = devices.put_everywhere(scene, mesh=mesh)
     setup = Setup(config, model, settings, scene, sampler, capacity, hit_fraction, mesh=mesh)
     return setup._replace(epoch=_trace_epoch(setup))
-
-
-def _check_memory(batch: int, samples: int) -> None:
-    """Refuses steps that cannot fit into memory, before they are compiled.
-
-    Args:
-      batch: number of rays of a step.
-      samples: number of samples of a step on one device.
-
-    Raises:
-      ValueError: if a lower bound of what they take is more than there is.
-    """
-    free, least = devices.free_memory(), samples * _LEAST_BYTES
-    if free is not None and least > free:
-        raise ValueError(
-            f"A step of batch={batch} rays takes at least {least / 2**30:.1f} GiB, but "
-            f"{free / 2**30:.1f} GiB of memory are free. Lower batch to "
-            f"{max(1, batch * free // least)} or less, or samples_per_ray."
-        )
 
 
 def run_steps(
