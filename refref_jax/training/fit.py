@@ -21,6 +21,7 @@ import jax
 from jax.sharding import Mesh
 
 from refref_jax import atomic_files, compilation, configuration
+from refref_jax.compilation import at_once
 from refref_jax.data import image_files, scene_analysis, scene_folder, scene_source
 from refref_jax.data.batches import PixelSampler
 from refref_jax.data.meshes import MeshPart
@@ -309,10 +310,14 @@ def _train_field(
     """Trains a field, and returns the number of the last step."""
     surface = model.config.backdrop is not None
     sampler = read_pixels(config, folder, objects=objects if surface else None)
-    setup = loop.set_up(config, model.config, model.settings, objects, sampler, mesh=mesh)
+    traced = model.config, model.settings, objects, sampler
+    tasks = (
+        lambda: loop.set_up(config, *traced, mesh=mesh, compile_steps=True),
+        lambda: init_state(config.seed, model.config, config.schedule),
+    )
+    setup, state = at_once(lambda task: task(), tasks)
     _report_misses(setup, report)
     begun = time.monotonic()
-    state = init_state(config.seed, model.config, config.schedule)
     state = devices.put_everywhere(state, mesh=mesh)
     if checkpoints.newest() is not None:
         state = checkpoints.restore(state)

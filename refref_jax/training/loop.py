@@ -5,7 +5,7 @@ If all batches of an epoch fit in memory, they are only traced once. This module
 """
 
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -15,8 +15,8 @@ import optax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Int, UInt8
 
-from refref_jax.compilation import jit_quickly, runs_on_cpu
-from refref_jax.data.batches import PixelSampler
+from refref_jax.compilation import at_once, jit_quickly, runs_on_cpu, threads
+from refref_jax.data.batches import PixelBatch, PixelSampler
 from refref_jax.fields import registry
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import light_paths, path_tracing
@@ -354,11 +354,13 @@ def set_up(
     sampler: PixelSampler,
     *,
     mesh: Mesh | None = None,
+    compile_steps: bool = False,
 ) -> Setup:
     """Moves the scene to the devices, and estimates the number of paths per ray.
 
     The light paths of all pixels are kept if the run uses them more than once and they take at most
-    half a gibibyte; while they are concatenated, three times that is in use.
+    half a gibibyte; while they are concatenated, three times that is in use. `compile_steps`
+    compiles these beside the tracing, if cores are free: XLA compiles with one thread.
     """
     scene = jax.device_put(scene)
     if bends_light(model):  # paths through the surface are traced within the steps
@@ -379,7 +381,13 @@ def set_up(
     hit_fraction = float(found.hit_fraction)
     scene = devices.put_everywhere(scene, mesh=mesh)
     setup = Setup(config, model, settings, scene, sampler, capacity, hit_fraction, mesh=mesh)
-    return setup._replace(epoch=_trace_epoch(setup))
+    drawn, kept, shapes = _draw_first(setup)
+    tasks: list[Callable[[], Any]] = [lambda: _trace_epoch(setup)] if kept else []
+    if compile_steps and mesh is None and threads() > 1:
+        lower = functools.partial(pretrace.lower, setup.scene, drawn.rays, **_tracing(setup))
+        tasks = [*(tasks or [lambda: lower().compile()]), lambda: _compile_steps(setup, shapes)]
+    done = at_once(lambda task: task(), tasks)
+    return setup._replace(epoch=done[0] if kept else None)
 
 
 def run_steps(
@@ -456,21 +464,37 @@ def trace_batches(setup: Setup, numbers: Sequence[int]) -> PretracedBatches:
     return PretracedBatches(traced, *devices.put_everywhere(host, mesh=setup.mesh))
 
 
-def _trace_epoch(setup: Setup) -> PretracedBatches | None:
-    """Traces all batches in advance, if the run uses them more than once and they fit in memory.
-
-    They are traced in groups, each with its own capacity. Tracing in advance does not change
-    training, unless a group is full and drops paths, which depend on its batches.
-    """
+def _draw_first(setup: Setup) -> tuple[PixelBatch, bool, PretracedBatches]:
+    """Draws the first batches; returns whether all are kept, and the shapes of pre-traced ones."""
     config, batches = setup.config, setup.sampler.batches
     size = require(config.schedule.pretraced_batches)
-    groups = range(0, batches, size)
-    if require(config.schedule.steps) <= batches:
-        return None
     drawn = setup.sampler.draw(setup.sampler.numbers(0, size))
-    one = pretrace.eval_shape(setup.scene, drawn.rays, **_tracing(setup)), drawn.rgb
-    bytes_ = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(one))
-    if bytes_ * len(groups) > _MOST_BYTES:
-        return None
-    traced = [trace_batches(setup, range(first, first + size)) for first in groups]
+    traced = pretrace.eval_shape(setup.scene, drawn.rays, **_tracing(setup))
+    bytes_ = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves((traced, drawn.rgb)))
+    groups = -(-batches // size)
+    kept = require(config.schedule.steps) > batches and bytes_ * groups <= _MOST_BYTES
+    stacked: Any = traced, drawn.rgb, drawn.views if setup.model.learned_gains else None
+    count = batches if kept else size
+    shape = jax.ShapeDtypeStruct
+    paths, rgb, views = jax.tree.map(lambda x: shape((count, *x.shape[1:]), x.dtype), stacked)
+    order: Any = shape((size,), np.int32)
+    return drawn, kept, PretracedBatches(paths, rgb, order, views)
+
+
+def _trace_epoch(setup: Setup) -> PretracedBatches:
+    """Traces all batches in groups, each with its own capacity, before the first step.
+
+    This does not change training, unless a group is full and drops paths, which depend on it.
+    """
+    size, batches = require(setup.config.schedule.pretraced_batches), setup.sampler.batches
+    firsts = range(0, batches, size)
+    traced = [trace_batches(setup, range(first, first + size)) for first in firsts]
     return jax.tree.map(lambda *parts: jnp.concatenate(parts)[:batches], *traced)
+
+
+def _compile_steps(setup: Setup, pretraced: PretracedBatches) -> None:
+    """Compiles `train_steps` for arrays of these shapes; JAX keeps the program."""
+    config, model = setup.config, setup.model
+    begin = functools.partial(init_state, config.seed, model, config.schedule)
+    step, options = jax.ShapeDtypeStruct((), np.int32), {"config": config, "model": model}
+    train_steps.lower(jax.eval_shape(begin), pretraced, step, step, mesh=None, **options).compile()

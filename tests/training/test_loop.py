@@ -16,7 +16,7 @@ from refref_jax.optics.path_settings import PAPER, STRAIGHT, TREE, capacities
 from refref_jax.render import checkpoint_io
 from refref_jax.render.checkpoint_io import load_model
 from refref_jax.render.model import Params, path_detail
-from refref_jax.training import loop, run_folder
+from refref_jax.training import devices, loop, run_folder
 from refref_jax.training.loop import init_state
 from refref_jax.training.run_folder import Checkpoints
 from tests.factories import scenes, small_model
@@ -41,8 +41,9 @@ _ADDED_SINCE = {
 _GEOMETRY = scenes.build(scenes.ball(1.3, subdivisions=2))
 
 
-def _setup(config=CONFIG, settings=PAPER):
-    return loop.set_up(config, MODEL, settings, _GEOMETRY, small_model.sampler(config.seed))
+def _setup(config=CONFIG, settings=PAPER, **options):
+    pixels = small_model.sampler(config.seed)
+    return loop.set_up(config, MODEL, settings, _GEOMETRY, pixels, **options)
 
 
 def _start(config=CONFIG):
@@ -152,6 +153,30 @@ def test_one_pool_is_traced_ahead_and_no_more(monkeypatch):
     traced.clear()
     counts = [len(traced) for _ in loop.run_steps(setup, _start(), 12)]
     assert counts == [2] * 4 + [3] * 8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("steps", [12, 34])
+def test_what_is_compiled_before_the_first_step_is_not_compiled_again(steps, monkeypatch):
+    monkeypatch.setattr(loop, "threads", lambda: 2)
+    schedule = dataclasses.replace(CONFIG.schedule, steps=steps)
+    config = dataclasses.replace(CONFIG, schedule=schedule, seed=77)  # of no other test
+    setup = _setup(config, compile_steps=True)
+    assert (setup.epoch is not None) == (steps > setup.sampler.batches)
+    compiled = []
+
+    def note(event, seconds, **details):
+        if event.endswith("backend_compile_duration"):
+            compiled.append(details.get("fun_name"))
+
+    state = devices.put_everywhere(_start(config), mesh=None)
+    jax.monitoring.register_event_duration_secs_listener(note)
+    try:
+        taken = list(itertools.islice(loop.run_steps(setup, state, steps), 2))
+    finally:
+        jax.monitoring.unregister_event_duration_listener(note)
+    assert int(taken[-1][0].step) == 2
+    assert not [name for name in compiled if "train_steps" in name or "pretrace" in name]
 
 
 @pytest.mark.slow
