@@ -312,7 +312,7 @@ def _train_field(
     sampler = read_pixels(config, folder, objects=objects if surface else None)
     traced = model.config, model.settings, objects, sampler
     tasks = (
-        lambda: loop.set_up(config, *traced, mesh=mesh, compile_steps=True),
+        lambda: loop.set_up(config, *traced, mesh=mesh, beside=loop.compile_steps),
         lambda: init_state(config.seed, model.config, config.schedule),
     )
     setup, state = at_once(lambda task: task(), tasks)

@@ -354,13 +354,13 @@ def set_up(
     sampler: PixelSampler,
     *,
     mesh: Mesh | None = None,
-    compile_steps: bool = False,
+    beside: Callable[["Setup", PretracedBatches], Any] | None = None,
 ) -> Setup:
     """Moves the scene to the devices, and estimates the number of paths per ray.
 
     The light paths of all pixels are kept if the run uses them more than once and they take at most
-    half a gibibyte; while they are concatenated, three times that is in use. `compile_steps`
-    compiles these beside the tracing, if cores are free: XLA compiles with one thread.
+    half a gibibyte; while they are concatenated, three times that is in use. Where cores are free,
+    `beside` is called while they are traced, such as `compile_steps`.
     """
     scene = jax.device_put(scene)
     if bends_light(model):  # paths through the surface are traced within the steps
@@ -383,11 +383,19 @@ def set_up(
     setup = Setup(config, model, settings, scene, sampler, capacity, hit_fraction, mesh=mesh)
     drawn, kept, shapes = _draw_first(setup)
     tasks: list[Callable[[], Any]] = [lambda: _trace_epoch(setup)] if kept else []
-    if compile_steps and mesh is None and threads() > 1:
+    if beside is not None and mesh is None and threads() > 1:
         lower = functools.partial(pretrace.lower, setup.scene, drawn.rays, **_tracing(setup))
-        tasks = [*(tasks or [lambda: lower().compile()]), lambda: _compile_steps(setup, shapes)]
+        tasks = [*(tasks or [lambda: lower().compile()]), lambda: beside(setup, shapes)]
     done = at_once(lambda task: task(), tasks)
     return setup._replace(epoch=done[0] if kept else None)
+
+
+def compile_steps(setup: Setup, pretraced: PretracedBatches) -> None:
+    """Compiles `train_steps` for pre-traced batches of these shapes; JAX keeps the program."""
+    config, model = setup.config, setup.model
+    begin = functools.partial(init_state, config.seed, model, config.schedule)
+    step, options = jax.ShapeDtypeStruct((), np.int32), {"config": config, "model": model}
+    train_steps.lower(jax.eval_shape(begin), pretraced, step, step, mesh=None, **options).compile()
 
 
 def run_steps(
@@ -490,11 +498,3 @@ def _trace_epoch(setup: Setup) -> PretracedBatches:
     firsts = range(0, batches, size)
     traced = [trace_batches(setup, range(first, first + size)) for first in firsts]
     return jax.tree.map(lambda *parts: jnp.concatenate(parts)[:batches], *traced)
-
-
-def _compile_steps(setup: Setup, pretraced: PretracedBatches) -> None:
-    """Compiles `train_steps` for arrays of these shapes; JAX keeps the program."""
-    config, model = setup.config, setup.model
-    begin = functools.partial(init_state, config.seed, model, config.schedule)
-    step, options = jax.ShapeDtypeStruct((), np.int32), {"config": config, "model": model}
-    train_steps.lower(jax.eval_shape(begin), pretraced, step, step, mesh=None, **options).compile()

@@ -161,7 +161,7 @@ def test_what_is_compiled_before_the_first_step_is_not_compiled_again(steps, mon
     monkeypatch.setattr(loop, "threads", lambda: 2)
     schedule = dataclasses.replace(CONFIG.schedule, steps=steps)
     config = dataclasses.replace(CONFIG, schedule=schedule, seed=77)  # of no other test
-    setup = _setup(config, compile_steps=True)
+    setup = _setup(config, beside=loop.compile_steps)
     assert (setup.epoch is not None) == (steps > setup.sampler.batches)
     compiled = []
 
