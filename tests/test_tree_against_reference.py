@@ -36,8 +36,7 @@ _VIEWS = (0, 10)
 _RULES = [
     (path_settings.STRAIGHT, reference_tree.STRAIGHT),
     pytest.param(path_settings.PAPER, reference_tree.PAPER, marks=pytest.mark.slow),
-    # Of every run of the suite, `test_against_cycles` has the same scene.
-    pytest.param(path_settings.TREE, reference_tree.TREE, marks=pytest.mark.slow),
+    (path_settings.TREE, reference_tree.TREE),
 ]
 
 

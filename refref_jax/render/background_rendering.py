@@ -8,8 +8,9 @@ pytree, such as `jax.tree_util.Partial(function, arrays)`, its arrays are argume
 program; values that a plain function closes over are constants, and every new function triggers a
 compilation.
 
-Rays are rendered in tiles of fixed size, so that memory is bounded and programs compile once: this
-is one of the modules that call `jax.jit`.
+Rays are rendered in tiles, so that memory is bounded. The size of a tile is a power of two, chosen
+by the number of rays that meet objects: a new one is compiled. This is one of the modules that call
+`jax.jit`.
 """
 
 import functools
@@ -277,10 +278,13 @@ def render_known_camera(
             casts, rays[here] = casts + finer.casts, refined_rays_per_pixel
             linear[here], dropped[here] = finer.linear.mean(axis=1), finer.dropped.mean(axis=1)
             beside = ~met.all(axis=1) & (many > refined_rays_per_pixel)
-            here, known = (here[0][beside], here[1][beside]), (finer.linear[beside], met[beside])
+            here = here[0][beside], here[1][beside]
             straight = pinholes.rays_of_pixels(cameras, view, *here, side=side_of(many))
-            linear[here] = _with_more_background(scene, radiance, straight, *known, settings, tile)
-            casts, rays[here] = casts + straight.radii.size, many
+            few = finer.linear[beside], finer.dropped[beside], met[beside]
+            linear[here], dropped[here] = _with_more_background(
+                scene, radiance, straight, *few, settings, tile
+            )
+            casts, rays[here] = casts + straight.radii.size * (settings.max_bends > 0), many
     rgb = np.clip(np.asarray(pixels.linear_to_srgb(jax.device_put(linear))), 0.0, 1.0)
     return KnownImage(rgb, linear, rays, dropped, casts)
 
@@ -366,26 +370,29 @@ def _with_more_background(
     scene: Scene,
     radiance: Radiance,
     rays: Rays,
-    seen: Float[np.ndarray, "pixels few 3"],
+    linear: Float[np.ndarray, "pixels few 3"],
+    dropped: Float[np.ndarray, "pixels few 3"],
     met: Bool[np.ndarray, "pixels few"],
     settings: PathSettings,
     tile: int,
-) -> Float[np.ndarray, "pixels 3"]:
-    """Returns the mean colour of pixels over many rays, of which only straight ones are rendered.
+) -> tuple[Float[np.ndarray, "pixels 3"], Float[np.ndarray, "pixels 3"]]:
+    """Returns mean colours and dropped throughput over many rays, of which straight are rendered.
 
-    Of few rays the colours are known (`seen`), and which `met` an object. One of many that meets an
-    object has the mean colour of the few that did in its pixel, and is straight where none did.
+    Those of few rays are known, and which `met` an object. One of many that meets an object counts
+    as the mean of the few that did in its pixel, and as straight where none did.
 
     Source: double sampling for stratification; Neyman, Contribution to the Theory of Sampling Human
     Populations (1938).
     """
-    colours = _in_tiles(scene, radiance, rays, None, settings=STRAIGHT, tile=tile).linear
+    straight = _in_tiles(scene, radiance, rays, None, settings=STRAIGHT, tile=tile).linear
+    hits = np.zeros(rays.radii.shape, bool)
     if settings.max_bends > 0:
         hits, _, _ = images.split_by_hit(scene.surfaces, rays, tile=tile, instead=_INSTEAD)
-        count = met.sum(axis=1, keepdims=True)
-        glass = np.sum(seen * met[..., None], axis=1) / np.maximum(1, count)
-        colours = np.where((hits & (count > 0))[..., None], glass[:, None], colours)
-    return colours.mean(axis=1)
+    hits &= met.any(axis=1, keepdims=True)
+    share = hits.mean(axis=1, keepdims=True) / np.maximum(1, met.sum(axis=1, keepdims=True))
+    glass, lost = (np.sum(x, axis=1, where=met[..., None]) for x in (linear, dropped))
+    beside = np.sum(straight, axis=1, where=~hits[..., None]) / rays.radii.shape[1]
+    return beside + np.where(share > 0.0, share * glass, 0.0), share * lost
 
 
 @functools.partial(jit_quickly, static_argnames="settings")

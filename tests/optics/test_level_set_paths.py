@@ -140,7 +140,6 @@ def test_paths_are_those_of_a_fine_mesh_with_smooth_normals():
         assert np.mean(np.abs(one - other).max(axis=-1) < 2e-3) > 0.95
 
 
-@pytest.mark.slow
 def test_paths_through_a_torus_are_those_of_embree():
     """Light leaves and enters again: four bends, of a fine mesh by an independent program."""
     mesh = trimesh.creation.torus(*_TORUS, major_sections=400, minor_sections=200)

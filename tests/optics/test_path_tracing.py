@@ -98,7 +98,6 @@ def test_a_slab_shifts_light_sideways(degrees):
     np.testing.assert_allclose(paths.tau[0, 2] - paths.tau[0, 1], inside, atol=_PLANAR_TOLERANCE)
 
 
-@pytest.mark.slow
 def test_a_right_prism_turns_light_by_total_reflection():
     scene = scenes.build(scenes.right_prism())
     # Down through the leg z = 1 plane's neighbour x = 0, against the hypotenuse, out at z = 0.
@@ -110,7 +109,6 @@ def test_a_right_prism_turns_light_by_total_reflection():
     np.testing.assert_array_equal(paths.media[0, :4], [AMBIENT, 1, 1, AMBIENT])
 
 
-@pytest.mark.slow
 def test_a_ball_of_glass():
     scene = scenes.build(scenes.ball(1.0, subdivisions=5))
     _check_against_spheres(scene, [Sphere(1.0, 1.5, 1.0)], [0.0, 0.2, 0.5, 0.8], 2)

@@ -121,7 +121,6 @@ def test_the_tint_colours_every_crossing_and_every_reflection():
         np.testing.assert_allclose(ends.throughput[escaped], weight[None], rtol=1e-4)
 
 
-@pytest.mark.slow
 def test_absorption_takes_light_by_the_length_of_the_way_inside():
     absorption = np.array([0.0, 1.0, 3.0])
     sines = np.array([0.0, 0.6, -0.6, 0.3])

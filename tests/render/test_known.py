@@ -330,7 +330,7 @@ def test_straight_rays_are_refined_as_their_background(scene):
     options = {"settings": STRAIGHT, "refined_rays_per_pixel": 100, "tolerance": 0.0}
     seen = render_known_camera(scene, _environment(), _CAMERA, 0, tile=_TILE, **options)
     fine = render_known(scene, _environment(), _rays(12), settings=STRAIGHT, tile=_TILE)
-    assert np.all(seen.rays == 144)
+    assert np.all(seen.rays == 144) and seen.casts == 0
     np.testing.assert_allclose(seen.linear, cameras.box_filter(fine.linear, 12), atol=1e-5)
 
 
@@ -372,6 +372,20 @@ def test_a_camera_inside_an_object_has_its_interior_list():
     )
     expected = cameras.box_filter(cameras.image_rays(cameras.supersample(here, 2), 0).directions, 2)
     np.testing.assert_allclose(seen.linear, expected + 2.0, atol=0.05)
+
+
+def test_light_that_a_refined_pixel_loses_is_told(scene):
+    short = dataclasses.replace(TREE, max_bends=2, truncated_paths="black")
+    seen = render_known_camera(
+        scene, _WHITE, _CAMERA, 0, settings=short, refined_rays_per_pixel=9, tolerance=0.0
+    )
+    assert np.max(seen.dropped) > 0.0 and np.any(seen.rays == 36)
+    np.testing.assert_allclose(seen.linear + seen.dropped, 1.0, atol=1e-5)
+
+
+def test_a_background_of_infinite_radiance_gives_no_nan(scene):
+    bright = lambda origin, direction: jnp.full(3, jnp.inf) * jnp.sign(direction[2] + 1.1)
+    assert not np.any(np.isnan(_image(scene, bright, refined_rays_per_pixel=9, tolerance=0.0).rgb))
 
 
 def test_few_rays_at_once_make_the_same_image(scene, monkeypatch):
