@@ -252,7 +252,7 @@ def render_known_camera(
       ...     glass, sky, camera, 0, settings=settings, refined_rays_per_pixel=16
       ... )
       >>> image.rgb.shape, sorted(set(image.rays.ravel().tolist()))
-      ((8, 8, 3), [4, 16])
+      ((8, 8, 3), [4, 64])
     """
     _check_refinement(rays_per_pixel, refined_rays_per_pixel, tolerance)
     scene, radiance = jax.device_put((scene, _as_argument(radiance)))
