@@ -47,7 +47,7 @@ def train(mesh, *, steps, settings, kept=True, folder=None, resumed=None):
             checkpoints.save(state)
     weights = pool.traced.paths.throughput
     return {
-        "reports": [[float(value) for value in report] for report in reports],
+        "reports": [[float(x) for x in jax.tree.leaves(report)] for report in reports],
         "params": [float(jnp.sum(jnp.abs(leaf))) for leaf in jax.tree.leaves(state.params)],
         "light": jax.device_get(jax.jit(lambda x: jnp.sum(x, axis=(1, 2)))(weights)).tolist(),
         "slots": weights.shape[1],
