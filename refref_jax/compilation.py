@@ -190,8 +190,8 @@ def threads() -> int:
     """Returns how many elements `at_once` works on at the same time: two, or one.
 
     One program does not keep two cores busy: parts of it have one thread, and nothing runs while
-    the host prepares its arguments. There is one thread on accelerators, where this process may use
-    a single core, and while JAX transforms the calling function.
+    the host prepares its arguments. It is one on accelerators, if this process may use a single
+    core only, and while JAX transforms the calling function.
     """
     affinity = getattr(os, "sched_getaffinity", None)  # of Linux
     cores = len(affinity(0)) if affinity else os.cpu_count() or 1

@@ -173,7 +173,17 @@ def test_only_the_function_for_the_platform_is_traced_and_once(platform, name, m
     assert traced == [name] and ("sine" in text) == (name == "other")
 
 
-def test_results_that_are_computed_at_once_keep_their_order():
+def test_a_process_with_one_core_works_in_its_own_thread(monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {3}, raising=False)
+    assert compilation.threads() == 1
+    here = compilation.at_once(lambda number: threading.get_ident(), range(3))
+    assert here == [threading.get_ident()] * 3
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 3, 5}, raising=False)
+    assert compilation.threads() == 2 and compilation.at_once(abs, range(3)) == [0, 1, 2]
+
+
+def test_results_that_are_computed_at_once_keep_their_order(monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 1}, raising=False)
     both = threading.Barrier(2, timeout=60.0)
 
     def wait(x, y):

@@ -11,6 +11,7 @@ calls them in this order; the command `train` calls it as well.
 import contextlib
 import functools
 import math
+import operator
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -310,12 +311,10 @@ def _train_field(
     """Trains a field, and returns the number of the last step."""
     surface = model.config.backdrop is not None
     sampler = read_pixels(config, folder, objects=objects if surface else None)
-    traced = model.config, model.settings, objects, sampler
-    tasks = (
-        lambda: loop.set_up(config, *traced, mesh=mesh, beside=loop.compile_steps),
-        lambda: init_state(config.seed, model.config, config.schedule),
-    )
-    setup, state = at_once(lambda task: task(), tasks)
+    set_up = functools.partial(loop.set_up, config, model.config, model.settings, objects, sampler)
+    begin = functools.partial(init_state, config.seed, model.config, config.schedule)
+    tasks = functools.partial(set_up, mesh=mesh, beside=loop.compile_steps), begin
+    setup, state = at_once(operator.call, tasks)
     _report_misses(setup, report)
     begun = time.monotonic()
     state = devices.put_everywhere(state, mesh=mesh)

@@ -5,6 +5,7 @@ If all batches of an epoch fit in memory, they are only traced once. This module
 """
 
 import functools
+import operator
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -387,7 +388,7 @@ def set_up(
     if beside is not None and mesh is None and threads() > 1:
         lower = functools.partial(pretrace.lower, setup.scene, drawn.rays, **_tracing(setup))
         tasks = [*(tasks or [lambda: lower().compile()]), lambda: beside(setup, shapes)]
-    done = at_once(lambda task: task(), tasks)
+    done = at_once(operator.call, tasks)
     return setup._replace(epoch=done[0] if kept else None)
 
 
