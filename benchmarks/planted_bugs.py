@@ -428,7 +428,7 @@ BUGS = (
     Bug(
         "the best shape is chosen, however little better it is",
         "reconstruct/model_selection.py",
-        "if worse.mean <= max(_WORSE * worse.error, _LEVEL):",
+        "if worse.mean <= max(_WORSE * worse.error, level):",
         "if worse.mean <= max(0.0 * worse.error, _LEVEL):",
         (f"{_REFRACTION}::test_the_smallest_shape_within_two_standard_errors_is_chosen",),
     ),

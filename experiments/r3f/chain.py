@@ -65,7 +65,8 @@ def reconstruct(
             say(f"geometry: {config.geometry} of the training {read}, {config.resolution} cells")
             if without := _views_without_object(scene):
                 say(f"geometry: {without} training views are left out, whose masks mark no object")
-            facts = geometry_stage.run(scene, out, config)
+            families = config.refinement == "light" and not _has_backdrop(scene, out, config)
+            facts = geometry_stage.run(scene, out, config, families=families)
             found = dataclasses.replace(found, geometry=facts, index=None, light=None, report=None)
             records.write(out, found)
         say(_describe_geometry(found))
@@ -222,6 +223,18 @@ def _refined(scene: Path, out: Path, found: Reconstruction, say: Say) -> Reconst
         records.write(out, dataclasses.replace(found, index=None, light=None, report=None))
         _refuse_index(out, found.index.index)
     return found
+
+
+def _has_backdrop(scene: Path, out: Path, config: ReconstructionConfig) -> bool:
+    """Returns whether the background is a surface before which light can refine a shape."""
+    return index_stage.has_backdrop(
+        scene,
+        out / _INDEX_FOLDER,
+        seed=config.seed,
+        space=config.space,
+        radius=config.radius,
+        centre=config.centre,
+    )
 
 
 def _light(scene: Path, out: Path, found: Reconstruction) -> LightFacts:

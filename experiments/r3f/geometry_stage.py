@@ -19,6 +19,7 @@ from refref_jax.reconstruct import occupancy
 from refref_jax.reconstruct.grids import Grid, find_isosurface
 from refref_jax.reconstruct.masks import Views, carve
 from refref_jax.reconstruct.mesh_distance import carved_alone, silhouette_overlap, without_outliers
+from refref_jax.reconstruct.model_selection import shape_from_outlines
 from refref_jax.reconstruct.occupancy import OccupancyTrainingConfig
 from refref_jax.reconstruct.refinement import Refinement, refine
 
@@ -85,8 +86,16 @@ GEOMETRIES: dict[str, Callable[[Inputs, ReconstructionConfig], Grid]] = {
 """Methods by name, whose grid is negative inside the object."""
 
 
-def run(scene: Path, out: Path, config: ReconstructionConfig) -> GeometryFacts:
+def run(
+    scene: Path, out: Path, config: ReconstructionConfig, *, families: bool = False
+) -> GeometryFacts:
     """Reconstructs the surface and writes it to `{out}/geometry`.
+
+    Args:
+      scene: folder of the scene.
+      out: folder of the reconstruction.
+      config: options of the reconstruction.
+      families: whether the outlines may choose a family of shapes, as where no light can.
 
     Raises:
       ValueError: if there are no masks, or no object fits them.
@@ -97,8 +106,12 @@ def run(scene: Path, out: Path, config: ReconstructionConfig) -> GeometryFacts:
     cut = find_isosurface(GEOMETRIES[config.geometry](Inputs(scene, out, views, names), config))
     trusted = without_outliers(cut, views, config.outliers)
     refined = refine(cut, Refinement(), views=trusted)
-    mesh = refined[-1].mesh
     befores = [cut, *(stage.mesh for stage in refined)]
+    mesh = befores[-1]
+    first = refined[0].mesh  # not smoothed yet
+    chosen = shape_from_outlines(first, trusted, seed=config.seed) if families else None
+    if chosen is not None:
+        mesh = chosen.mesh
     name = f"{_object(scene)}_{MATERIAL}.ply"
     with atomic_files.written_folder(out / FOLDER) as folder:
         meshes.write_mesh(folder / name, *mesh)
@@ -106,10 +119,13 @@ def run(scene: Path, out: Path, config: ReconstructionConfig) -> GeometryFacts:
         name,
         mesh,
         views,
-        stages=tuple(
-            stage.name
-            for before, stage in zip(befores, refined, strict=False)
-            if not np.array_equal(before.vertices, stage.mesh.vertices)
+        stages=(
+            *(
+                stage.name
+                for before, stage in zip(befores, refined, strict=False)
+                if not np.array_equal(before.vertices, stage.mesh.vertices)
+            ),
+            *(() if chosen is None else (f"{chosen.name} by its outlines",)),
         ),
         refused=tuple(f"{stage.name}: {stage.refused}" for stage in refined if stage.refused),
         warnings=(

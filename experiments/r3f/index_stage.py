@@ -244,6 +244,21 @@ def learn_backdrop(
     return backdrop_of(folder, _learned(scene, folder / BACKGROUND, wanted))
 
 
+def has_backdrop(
+    scene: Path,
+    folder: Path,
+    *,
+    seed: int,
+    space: Space | None = None,
+    radius: float | None = None,
+    centre: Position | None = None,
+) -> bool:
+    """Returns whether `learn_backdrop`, which has the same arguments, returns one."""
+    given = {"background": space, "radius": radius, "centre": centre, "seed": seed}
+    wanted = _resolved(scene, folder / BACKGROUND, STEPS, **given)
+    return wanted.model.config.backdrop is not None
+
+
 def _resolved(scene: Path, run: Path, steps: int, **given: Any) -> Resolved:
     """Returns how the background is to be learned, with the options that are given."""
     config = TrainConfig().override(

@@ -333,8 +333,7 @@ def _between_knots(
     if profile.closed:
         cubics = [_even_spline(knots, float(length[-1]), True)] * 2
     else:
-        # The radius is zero at both poles.
-        radii = CubicSpline(knots, one[:, 1:-1], bc_type="natural")
+        radii = CubicSpline(knots, one[:, 1:-1], bc_type="natural")  # zero at both poles
         cubics = [radii, CubicSpline(knots, one, bc_type="clamped")]
     weights, matrices = np.ones((len(points), 1)), [cubic(length) for cubic in cubics]
     for _ in range(1 if math.isinf(ridges) else _RIDGE_ROUNDS):
@@ -480,8 +479,10 @@ def fit_revolution(
     return Revolution(smooth.axis, smooth.profile, size)
 
 
-def candidates(mesh: Mesh) -> list[Shape]:
+def candidates(mesh: Mesh, *, furthest: float = FURTHEST) -> list[Shape]:
     """Returns the families that come near a mesh, the fewest unknowns first, the free surface last.
+
+    They are within an rms distance of `furthest`, a share of the diameter of the mesh.
 
     Example:
       >>> shapes = candidates(mesh)
@@ -489,12 +490,11 @@ def candidates(mesh: Mesh) -> list[Shape]:
       ['sphere', 'surface of revolution', 'free surface']
 
     Raises:
-      ReconstructionError: if the mesh is empty, flat, inside out or not finite, or
-        scikit-image is not installed.
+      ReconstructionError: if the mesh has no volume, or scikit-image is not installed.
     """
-    fits: list[Shape | None] = [fit_sphere(mesh), fit_torus(mesh), fit_polyhedron(mesh)]
-    smooth = fit_axis_and_profile(mesh, cloud_of(mesh), diameter(mesh.vertices))
-    if smooth is not None:
-        fits += [fit_turned(mesh, smooth=smooth), fit_revolution(mesh, smooth=smooth)]
-    found: list[Shape] = [fit for fit in fits if fit is not None]
-    return [*sorted(found, key=lambda shape: len(shape.start())), FreeSurface(mesh)]
+    first = fit_sphere, fit_torus, fit_polyhedron
+    found: list[Shape | None] = [fit(mesh, furthest=furthest) for fit in first]
+    if smooth := fit_axis_and_profile(mesh, cloud_of(mesh), diameter(mesh.vertices)):
+        found += [f(mesh, furthest=furthest, smooth=smooth) for f in (fit_turned, fit_revolution)]
+    shapes = sorted((fit for fit in found if fit is not None), key=lambda fit: len(fit.start()))
+    return [*shapes, FreeSurface(mesh)]

@@ -1,23 +1,32 @@
-"""Which of several fitted models to keep: the smallest one that held-out pixels do not refuse.
+"""Which of several fitted models to keep: the smallest one that held-out views do not refuse.
 
 A `Trial` is a model that was fitted, with the errors of pixels that it was not fitted to. Errors of
 one view are alike, so views are what is counted: one trial is worse than another if the mean of the
 differences of their views' errors is above two standard errors.
+
+`shape_from_outlines` fits families to the outlines of masks alone, for objects that no light can
+refine. Masks that are wrong by a pixel or two make the body that they carve too small, and rough;
+a family has so few unknowns that their errors average out, and knows the side that no view shows.
 """
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 import scipy.sparse
 from jaxtyping import Float
 
 from refref_jax.geometry.triangle_meshes import Mesh
-from refref_jax.reconstruct import gauss_newton
+from refref_jax.reconstruct import families, gauss_newton
 from refref_jax.reconstruct.gauss_newton import Candidate, Fit, Model
+from refref_jax.reconstruct.masks import Views, views_at
+from refref_jax.reconstruct.mesh_distance import silhouette_overlap
+from refref_jax.reconstruct.outlines import Outlines
 from refref_jax.reconstruct.photometry import Backdrop, Photographs
-from refref_jax.reconstruct.shapes import mesh_of
+from refref_jax.reconstruct.polyhedra import fit_polyhedron
+from refref_jax.reconstruct.polytope_fit import fit_polytope
+from refref_jax.reconstruct.shapes import FixedShape, Shape, Unknowns, mesh_of
 
 # Number of normals whose deviations are found at once.
 _NORMALS = 4096
@@ -29,6 +38,17 @@ _WORSE = 2.0
 # as much.
 _LEVEL = 0.25 / 255.0
 
+# Largest rms distance of a mesh from a family that may explain its outlines, as a share of its
+# diameter: the body that masks carve reaches far below an object that no view shows from below.
+_NEAR_OUTLINES = 0.12
+
+# Pixels by which corners of a polyhedron stick out.
+_TOLERANCES = (4.0, 2.0, 1.0)
+
+# One view in this many judges shapes that are fitted to outlines. Distances beyond which outlines
+# have no say, in pixels, and steps with each. Largest error of a shape, as a share of the least.
+_JUDGE_EVERY, _REACHES, _OUTLINE_STEPS, _AS_GOOD = 5, (6.0, 3.0), 8, 1.05
+
 # Largest error of a hypothesis that might be true as well, relative to that of the chosen one.
 _CLOSE = 1.25
 
@@ -39,6 +59,22 @@ class ObjectModel(Model, Protocol):
 
     def index_of(self, x: Float[np.ndarray, " unknowns"]) -> float:
         """Returns that index at given unknowns."""
+
+
+@runtime_checkable
+class Judged(Protocol):
+    """What was fitted, and how views that it was not fitted to refuse it."""
+
+    @property
+    def unknowns(self) -> int:
+        """Number of its unknowns."""
+
+    @property
+    def by_view(self) -> Float[np.ndarray, " views"]:
+        """Error of each view."""
+
+
+AnyJudged = TypeVar("AnyJudged", bound=Judged)
 
 
 class Trial(NamedTuple):
@@ -60,6 +96,11 @@ class Trial(NamedTuple):
     def error(self) -> float:
         """Mean error of the judges."""
         return float(self.by_view.mean())
+
+    @property
+    def unknowns(self) -> int:
+        """Number of unknowns."""
+        return len(self.fit.x)
 
     @property
     def candidate(self) -> Candidate:
@@ -114,7 +155,7 @@ class Comparison(NamedTuple):
     error: float
 
 
-def compare(trial: Trial, best: Trial) -> Comparison:
+def compare(trial: Judged, best: Judged) -> Comparison:
     """Returns how much worse a trial is than the best, by the judges of each view."""
     difference = trial.by_view - best.by_view
     count = len(difference)
@@ -122,19 +163,19 @@ def compare(trial: Trial, best: Trial) -> Comparison:
     return Comparison(float(difference.mean()), error)
 
 
-def choose(trials: Sequence[Trial]) -> Trial:
+def choose(trials: Sequence[AnyJudged], *, level: float = _LEVEL) -> AnyJudged:
     """Returns the trial of fewest unknowns that is not worse than the best by two standard errors.
 
-    A difference of less than a quarter of an 8-bit level does not count. Of trials with as many
-    unknowns, the better one comes first.
+    Of trials with as many unknowns, the better one comes first.
 
     Args:
       trials: one or more trials.
+      level: difference that does not count; a quarter of an 8-bit level by default.
     """
-    best = min(trials, key=lambda trial: trial.error)
-    for trial in sorted(trials, key=lambda trial: (len(trial.fit.x), trial.error)):
+    best = min(trials, key=lambda trial: trial.by_view.mean())
+    for trial in sorted(trials, key=lambda trial: (trial.unknowns, trial.by_view.mean())):
         worse = compare(trial, best)
-        if worse.mean <= max(_WORSE * worse.error, _LEVEL):
+        if worse.mean <= max(_WORSE * worse.error, level):
             return trial
     return best
 
@@ -165,3 +206,90 @@ def normal_deviations(trial: Trial) -> Float[np.ndarray, " normals"]:
         both = some.multiply(spread) if scipy.sparse.issparse(some) else np.asarray(some) * spread
         found.append(np.asarray(both.sum(axis=1)).reshape(-1, 3).sum(axis=1))
     return np.degrees(np.sqrt(np.maximum(np.concatenate(found), 0.0)))
+
+
+class OutlineTrial(NamedTuple):
+    """A shape that was fitted to the outlines of masks.
+
+    Attributes:
+      shape: the shape.
+      x: its unknowns.
+      unknowns: their number; that of the vertices for the mesh from masks.
+      by_view: share of mask and silhouette of each judging view that is not in both.
+    """
+
+    shape: Shape
+    x: Unknowns
+    unknowns: int
+    by_view: Float[np.ndarray, " views"]
+
+
+class FamilyFit(NamedTuple):
+    """A family of shapes (`families`) by its name, and its surface."""
+
+    name: str
+    mesh: Mesh
+
+
+def shape_from_outlines(mesh: Mesh, views: Views, *, seed: int = 0) -> FamilyFit | None:
+    """Returns the smallest family of shapes that the outlines of masks do not refuse.
+
+    The families are fitted to four views in five; the others judge them and the mesh, by how much
+    of mask and silhouette is not in both (`choose`, of those within 5 % of the best). The one that
+    is kept is fitted to all views. Polyhedra have the corners that stick out of the outlines.
+
+    Args:
+      mesh: closed mesh of the object, from masks; not smoothed, or corners are rounded.
+      views: these masks and their cameras.
+      seed: seed of the draws of points.
+
+    Returns:
+      `None` if the mesh is better than any family.
+
+    Raises:
+      ReconstructionError: if the mesh is empty, flat, inside out or not finite, or
+        scikit-image is not installed.
+    """
+    judging = np.arange(len(views.masks)) % _JUDGE_EVERY == 0
+    fitted, judges = (views_at(views, each) for each in (~judging, judging))
+    if not len(fitted.masks):
+        return None
+
+    def trial(shape: Shape, unknowns: int) -> OutlineTrial:
+        x = fit_to_outlines(shape, fitted, seed=seed)
+        missed = 1.0 - silhouette_overlap(mesh_of(shape.pose(x)), *judges)
+        return OutlineTrial(shape, x, unknowns, missed)
+
+    *shapes, _ = families.candidates(mesh, furthest=_NEAR_OUTLINES)
+    bodies = (fit_polytope(mesh, fitted, tolerance=each) for each in _TOLERANCES)
+    polyhedra = [None if body is None else fit_polyhedron(body) for body in bodies]
+    shapes = [*shapes, *(each for each in polyhedra if each is not None)]
+    trials = [trial(shape, len(shape.start())) for shape in shapes]
+    trials.append(trial(FixedShape(mesh), mesh.vertices.size))
+    most = _AS_GOOD * min(each.by_view.mean() for each in trials)  # few views cannot tell
+    chosen = choose([each for each in trials if each.by_view.mean() <= most], level=0.0)
+    if isinstance(chosen.shape, FixedShape):
+        return None
+    x = fit_to_outlines(chosen.shape, views, seed=seed)
+    return FamilyFit(chosen.shape.name, mesh_of(chosen.shape.pose(x)))
+
+
+def fit_to_outlines(shape: Shape, views: Views, *, seed: int = 0) -> Unknowns:
+    """Fits the unknowns of a shape to the outlines of masks, by Gauss-Newton steps.
+
+    Args:
+      shape: a shape near the outlines.
+      views: masks and their cameras.
+      seed: seed of the draws of points.
+    """
+    x, scales = shape.start(), shape.scales()
+    for reach in _REACHES if len(x) else ():
+        outlines = Outlines(views, seed=seed, reach=reach, creased=True)
+        for _ in range(_OUTLINE_STEPS):
+            rows = outlines.of_surface(shape.pose(x))
+            weighted = rows.weights[:, None] * rows.derivatives
+            precision, gradient = shape.prior(x)
+            matrix = weighted.T @ rows.derivatives + precision
+            step = -np.linalg.solve(matrix, weighted.T @ rows.errors + gradient)
+            x = x + step / max(1.0, float(np.max(np.abs(step) / scales)))
+    return x

@@ -228,14 +228,40 @@ def fit_corners(mesh: Mesh, candidates: Mesh, views: Views, *, most: int = MOST)
     return body
 
 
-def _find(points: Points, views: Views, most: int) -> Corners:
+def fit_polytope(candidates: Mesh, views: Views, *, tolerance: float) -> Mesh | None:
+    """Returns the hull of the corners that stick out of the outlines by more than a tolerance.
+
+    Masks whose edges are wrong by a pixel or two have many corners that the object has not; a
+    tolerance of twice as much leaves those of the object.
+
+    Args:
+      candidates: mesh whose hull's vertices are the candidate corners, such as the visual hull.
+      views: masks and their cameras.
+      tolerance: pixels by which a corner must stick out.
+
+    Returns:
+      `None` if there are too many corners, too few masks, or all corners are in a plane.
+    """
+    views = _usable(candidates.vertices, views)
+    if len(views.masks) < _RANK:
+        return None
+    try:
+        corners = _find(hull(candidates).vertices, views, MOST, tolerances=(tolerance,))
+        return None if len(corners) > MOST else weigh_facets(of_points(corners))
+    except QhullError:
+        return None
+
+
+def _find(
+    points: Points, views: Views, most: int, *, tolerances: Sequence[float] = _TOLERANCES
+) -> Corners:
     """Returns the corners for the finest tolerance that needs at most `most` of them."""
     images = [signed_distances(mask).astype(np.float32) for mask in views.masks]
     points = points[_on_outlines(points, views)]
     directions = np.random.default_rng(0).normal(size=(_FIRST, 3))
     corners = points[np.unique(np.argmax(points @ directions.T, axis=0))]
     require = False
-    for tolerance in _TOLERANCES:
+    for tolerance in tolerances:
         more = _insert(corners, points, views, tolerance, most)
         if len(more) > most:
             break
