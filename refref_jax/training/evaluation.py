@@ -24,17 +24,19 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, UInt8
 
-from refref_jax import choices, metrics
+from refref_jax import choices, metrics, numerics
 from refref_jax.compilation import jit_quickly
 from refref_jax.data import scene_folder
 from refref_jax.geometry import cameras
 from refref_jax.geometry.cameras import Cameras
-from refref_jax.render import images, learned_media
+from refref_jax.render import images, learned_media, pixels
 from refref_jax.render.images import Rendering
 from refref_jax.render.model import Model
+from refref_jax.training.objective import SATURATED
 
 Measured = dict[str, float | None]
 """Metrics by name; `None` if a metric is undefined or not available."""
@@ -156,6 +158,9 @@ def evaluate(
         seconds = time.monotonic() - start
         first = first_distances(model, views, i)
         measured = measure(seen, truth, i, first=first, perceptual=perceptual)
+        if model.params.gains is not None:
+            mask = None if truth.masks is None else truth.masks[i]
+            measured |= measure_after_gain(np.asarray(seen.rgb), truth.images[i] / 255.0, mask)
         measured["seconds"] = seconds
         per_image.append({"name": name, **measured})
         if on_view is not None:
@@ -300,6 +305,43 @@ def measure_colours(
     if perceptual.flip is not None:
         result["flip"] = perceptual.flip(rendered, target)
     return result
+
+
+def measure_after_gain(
+    rendered: Float[np.ndarray, "h w 3"],
+    target: Float[np.ndarray, "h w 3"],
+    mask: Bool[np.ndarray, "h w"] | None,
+) -> Measured:
+    """Returns the PSNR of an image that has the exposure and white balance of the true one.
+
+    The gain of each channel of linear light is fitted to pixels beside the object by least squares,
+    so that what is seen through the object cannot affect it. Pixels that are saturated in either
+    image are left out; without others, the gain is 1.
+
+    Args:
+      rendered: rendered image, sRGB in `[0, 1]`.
+      target: true image.
+      mask: mask of the object, if there is one.
+    """
+    inside = np.zeros(target.shape[:2], bool) if mask is None else mask
+    with jax.enable_x64(True), jax.default_device(_device_of_doubles()):
+        pair = jax.device_put((rendered.astype(np.float64), target.astype(np.float64)))
+        gained = np.asarray(_with_gain(*pair, jax.device_put(~inside)))
+    found = measure_colours(gained, target, mask, _WITHOUT_EYES)
+    return {f"{name}_after_gain": found[name] for name in ("psnr", "psnr_masked")}
+
+
+@jit_quickly
+def _with_gain(
+    rendered: Float[Array, "h w 3"], target: Float[Array, "h w 3"], beside: Bool[Array, "h w"]
+) -> Float[Array, "h w 3"]:
+    """Returns the image with the gains of `measure_after_gain`."""
+    usable = beside & jnp.all(jnp.maximum(rendered, target) < SATURATED, axis=-1)
+    seen, true = pixels.srgb_to_linear(rendered), pixels.srgb_to_linear(target)
+    weights = jnp.where(usable[..., None], seen, 0.0)
+    power, shared = (jnp.sum(weights * each, axis=(0, 1)) for each in (seen, true))
+    gain = jnp.where(power > 0.0, numerics.safe_divide(shared, power), 1.0)
+    return jnp.clip(pixels.linear_to_srgb(gain[None, None] * seen), 0.0, 1.0)
 
 
 @jit_quickly

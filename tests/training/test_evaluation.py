@@ -150,6 +150,51 @@ def test_eyes_are_asked_where_they_are_at_hand(tmp_path):
     assert small["lpips"] is None and small["flip"] == 0.125
 
 
+def _photograph(gain, *, lamp=False):
+    """Returns a rendering, a photograph of it with gains, and a mask of part of it."""
+    rng = np.random.default_rng(0)
+    linear = rng.uniform(0.05, 0.5, (20, 20, 3))
+    encode = lambda x: np.where(x > 0.0031308, 1.055 * x ** (1.0 / 2.4) - 0.055, 12.92 * x)
+    rendered, target = encode(linear), np.clip(encode(linear * gain), 0.0, 1.0)
+    mask = np.zeros((20, 20), bool)
+    mask[5:12, 6:15] = True
+    if lamp:
+        target[:3] = 1.0
+    return rendered, target, mask
+
+
+@pytest.mark.parametrize("lamp", [False, True])
+def test_a_gain_of_the_photograph_costs_nothing_after_it_is_fitted(lamp):
+    rendered, target, mask = _photograph(np.array([1.2, 0.9, 0.8]), lamp=lamp)
+    found = evaluation.measure_after_gain(rendered, target, mask)
+    assert found["psnr_masked_after_gain"] > 100.0
+    assert (found["psnr_after_gain"] > 100.0) != lamp
+    plain = evaluation.measure_colours(rendered, target, mask, _NOTHING)
+    assert plain["psnr_masked"] < 30.0
+
+
+def test_what_is_seen_through_the_object_has_no_say_in_the_gain():
+    rendered, target, mask = _photograph(np.ones(3))
+    target = np.where(mask[..., None], 0.5 * target, target)
+    found = evaluation.measure_after_gain(rendered, target, mask)
+    plain = evaluation.measure_colours(rendered, target, mask, _NOTHING)
+    assert found["psnr_masked_after_gain"] == pytest.approx(plain["psnr_masked"], abs=1e-6)
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0])
+def test_black_and_saturated_images_have_no_gain(value):
+    rendered, target, mask = _photograph(np.ones(3))
+    found = evaluation.measure_after_gain(np.full_like(rendered, value), target, mask)
+    plain = evaluation.measure_colours(np.full_like(rendered, value), target, mask, _NOTHING)
+    assert found["psnr_after_gain"] == pytest.approx(plain["psnr"], abs=1e-6)
+
+
+def test_without_a_mask_all_pixels_are_beside_the_object():
+    rendered, target, _ = _photograph(np.array([0.7, 1.0, 1.1]))
+    found = evaluation.measure_after_gain(rendered, target, None)
+    assert found["psnr_after_gain"] > 100.0 and found["psnr_masked_after_gain"] is None
+
+
 def _model(settings):
     params = init_params(jax.random.key(0), MODEL)
     return Model(MODEL, settings, scenes.build(scenes.ball(1.3, subdivisions=1)), params)
