@@ -221,6 +221,7 @@ class GridRadianceConfig(RadianceConfig):
       colour_width: width of the colour network's hidden layers.
       colour_depth: number of hidden layers of the colour network.
       colour_network: `skip` appends the colour network's inputs to the outputs of its first layer.
+      brightest: largest colour, sRGB; above 1 where lamps or windows shine.
     """
 
     grid: HashGridConfig
@@ -229,6 +230,7 @@ class GridRadianceConfig(RadianceConfig):
     colour_width: int
     colour_depth: int
     colour_network: ColourNetwork = "plain"
+    brightest: float = 1.0
 
 
 @dataclasses.dataclass(frozen=True)

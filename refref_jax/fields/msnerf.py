@@ -161,7 +161,9 @@ class _Decoder(nn.Module):
         rgb = jax.nn.sigmoid(layer(3)(hidden))
         hidden = nn.relu(layer(width)(features))
         gates = layer(1)(hidden)[:, 0]
-        return Blend(zipnerf.pad_colour(rgb), jax.nn.softmax(gates))
+        return Blend(
+            zipnerf.pad_colour(rgb, brightest=self.config.brightest), jax.nn.softmax(gates)
+        )
 
 
 def _size(name: str, *, sub_spaces: int, channels: int, decoder_width: int) -> FieldSize:

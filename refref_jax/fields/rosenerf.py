@@ -194,7 +194,9 @@ class _TwoRays(nn.Module):
         hidden = nn.relu(layer(config.density_width)(features[0] + features[1]))
         raw = layer(1 + config.bottleneck)(hidden)
         rgb = colour(raw[1:], direction, config)
-        return Radiance(zipnerf.activate_density(raw[0]), zipnerf.pad_colour(rgb))
+        return Radiance(
+            zipnerf.activate_density(raw[0]), zipnerf.pad_colour(rgb, brightest=config.brightest)
+        )
 
 
 def _size(name: str, *, width: int, depth: int) -> FieldSize:

@@ -71,9 +71,9 @@ def activate_density(raw: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     return jax.nn.softplus(raw + _DENSITY_SHIFT)
 
 
-def pad_colour(rgb: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Widens the range of colours from `[0, 1]` to `[-0.001, 1.001]`."""
-    return rgb * (1.0 + 2.0 * _COLOUR_PADDING) - _COLOUR_PADDING
+def pad_colour(rgb: Float[Array, "*shape"], *, brightest: float = 1.0) -> Float[Array, "*shape"]:
+    """Widens the range of colours from `[0, 1]` to `[-0.001, brightest + 0.001]`."""
+    return rgb * (brightest + 2.0 * _COLOUR_PADDING) - _COLOUR_PADDING
 
 
 class _DensityField(nn.Module):
@@ -124,7 +124,7 @@ class _RadianceField(nn.Module):
     def __call__(self, gaussians: Gaussians, direction: Float[Array, "3"]) -> Radiance:
         config = self.config
         density, rgb = density_and_colour(gaussians, direction, config)
-        return Radiance(activate_density(density), pad_colour(rgb))
+        return Radiance(activate_density(density), pad_colour(rgb, brightest=config.brightest))
 
 
 def _proposal(

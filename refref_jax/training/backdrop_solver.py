@@ -46,15 +46,13 @@ from refref_jax.training.backdrop_equations import (
     exposed,
     sum_of,
 )
+from refref_jax.training.objective import SATURATED
 
 # One error in this many determines their typical size.
 _EVERY = 17
 
 # Linear value below which sRGB has a constant slope here, or dark noise would weigh most.
 _DARK = 2e-3
-
-# An 8-bit value at or above this one is saturated.
-_SATURATED = 254.5 / 255.0
 
 # Residuals, in units of their typical size, beyond which a pixel loses weight (Huber), and the
 # smallest typical residual: the rounding of 8 bits.
@@ -116,7 +114,7 @@ def _weights(predicted: Array, block: Block, typical: float | Array) -> Float[Ar
     secant = jnp.where(jnp.abs(difference) > 1e-3, jnp.abs(residual / difference), slope)
     secant = jnp.minimum(secant, jnp.max(slope, initial=0.0))
     huber = jnp.minimum(1.0, _TYPICAL * typical / jnp.maximum(jnp.abs(residual), 1e-6))
-    bright = (block.srgb >= _SATURATED) & (predicted >= block.linear)
+    bright = (block.srgb >= SATURATED) & (predicted >= block.linear)
     return jnp.where(bright, 0.0, huber * jnp.square(secant)) * block.kept[:, None]
 
 

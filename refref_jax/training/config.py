@@ -32,7 +32,7 @@ FIELD_ONLY = (
     *("data_loss", "interlevel_weight", "blurs", "distortion_weight", "hash_decay", "distortion"),
     *("path_losses", "steps", "warmup", "learning_rate", "final_learning_rate", "anneal", "batch"),
     *("pretraced_batches", "adam_b2", "sub_spaces", "eikonal_weight", "curvature_weight"),
-    *("gaussians", "splat_filter", "deformation_weights", *SURFACE_ONLY),
+    *("gaussians", "splat_filter", "deformation_weights", "brightest", *SURFACE_ONLY),
 )
 """Options that only a radiance field reads."""
 
@@ -170,8 +170,7 @@ class FieldConfig:
         learned; by default given if scene.json describes every part.
       footprint: Footprint of a pixel: widened by arc length (cone), or propagated through the bends
         by ray differentials (differential).
-      samples_per_ray: Numbers of samples per ray of each proposal level, then of the radiance
-        field, such as 32,20.
+      samples_per_ray: Samples per ray of each proposal level, then of the radiance field: 32,20.
       multisamples: Number of multisamples per interval, 1 or 6.
       log2_hashmap_size: Hash map size of the radiance field, base-2 logarithm of a level's entries.
       max_res: Finest resolution of the radiance field's hash grid, cells per side.
@@ -180,6 +179,7 @@ class FieldConfig:
         none.
       colour_network: Layers of the colour network: plain, or with a skip connection (skip), which
         appends its inputs to the outputs of its first layer, as in the paper's released code.
+      brightest: Largest colour of the radiance field, sRGB; above 1 where lamps or windows shine.
       contraction: Scenes whose space is contracted: unbounded ones, or all (always; the paper's
         released code), as if the size of their background were unknown.
       near: Near plane: distance of the first sample from the camera, world units; by default 0.05,
@@ -221,6 +221,7 @@ class FieldConfig:
     precision: choices.Precision | None = option(None, after=_KIND)
     dilation: float | None = option(None, after=_KIND)
     colour_network: choices.ColourNetwork = option("plain")
+    brightest: float = option(1.0)
     contraction: choices.Contraction = option("unbounded")
     near: float | None = option(None, after=_BOUNDS, comparison="none")
     far: float | None = option(None, after=_BOUNDS, comparison="none")
@@ -245,7 +246,7 @@ class FieldConfig:
                 f"There is no pattern with multisamples={self.multisamples}. Give 1 (on the centre "
                 "line) or 6 (Zip-NeRF's hexagon)."
             )
-        ranges = dict.fromkeys(("most_pixels", "gaussians"), (1, _MOST))
+        ranges = dict.fromkeys(("most_pixels", "gaussians"), (1, _MOST)) | {"brightest": (1, 8)}
         ranges |= {"backdrop_resolution": (4, _CELLS), "iterations": (1, _FINEST)}
         ranges |= {"sub_spaces": (1, _MOST_SUB_SPACES), "max_res": (1, _FINEST)}
         for name, (least, most) in ranges.items():

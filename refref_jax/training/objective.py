@@ -6,8 +6,9 @@ sums over all of them.
 
 Rendered colours are compared without clipping: colours below black or above white have gradients
 that move them back, and black pixels have the slope 12.92 of the transfer function (see
-`render.pixels`). Fields return colours in `[-0.001, 1.001]`, so that their sigmoid has a non-zero
-slope at black and white.
+`render.pixels`). Only saturated pixels may be brighter than they look: a brighter colour has no
+error there. Fields return colours in `[-0.001, 1.001]`, or more where lamps are seen, so that their
+sigmoid has a non-zero slope at black and white.
 
 Symbols: `s` is the normalised distance along a path, `w` its weights (see `sampling.stepfun`).
 """
@@ -31,6 +32,9 @@ from refref_jax.render.model import Params
 from refref_jax.render.volume_rendering import Histogram
 from refref_jax.sampling import stepfun
 from refref_jax.training.config import LossConfig, require
+
+SATURATED = 254.5 / 255.0
+"""Colour, sRGB, from which on an 8-bit pixel is saturated."""
 
 _CHARBONNIER_PADDING = 0.001
 
@@ -240,7 +244,7 @@ def measure(
       views: index of the image of each ray, if the gains of images are learned.
     """
     linear = totals.linear if views is None else totals.linear * gains(params)[views]
-    rgb = pixels.linear_to_srgb(linear)
+    rgb = _as_seen(pixels.linear_to_srgb(linear), target)
     mse = mean_squared_error(rgb, target)
     data = mse if config.data == "mse" else charbonnier(rgb, target)
     # Without paths, both are 0 with gradient 0.
@@ -272,6 +276,11 @@ def measure(
     loss += require(config.eikonal) * eikonal + weight * curvature
     share = numerics.safe_divide(sums.share, totals.paths)
     return report._replace(loss=loss, eikonal=eikonal, curvature=curvature, surface_share=share)
+
+
+def _as_seen(rgb: Float[Array, "rays 3"], target: Float[Array, "rays 3"]) -> Float[Array, "rays 3"]:
+    """Returns sRGB colours as a camera shows them that saturates in some pixels."""
+    return jnp.where((target >= SATURATED) & (rgb > target), target, rgb)
 
 
 def gains(params: Params) -> Float[Array, "views 3"]:

@@ -74,6 +74,9 @@ _NOT_READ = (
     *("interior", "tints", "tint_decay"),
 )
 
+# Kinds of field whose colours may exceed white.
+_BRIGHT = ("zipnerf", "msnerf", "raydef", "rosenerf")
+
 # Blur of the interlevel loss for each proposal level (Zip-NeRF, supplement); losses of a surface.
 _BLURS, _SURFACE = (0.03, 0.003), ("eikonal", "curvature")
 
@@ -187,7 +190,18 @@ def override_model(
                 f"grid, unlike {field.kind}. Leave it out."
             )
         field = dataclasses.replace(field, colour_network=asked.colour_network)
-    return dataclasses.replace(model, field=field)
+    return dataclasses.replace(model, field=_with_brightest(field, asked.brightest))
+
+
+def _with_brightest(field: RadianceConfig, brightest: float) -> RadianceConfig:
+    if brightest == 1.0:
+        return field
+    if not isinstance(field, hash_grid.GridRadianceConfig) or field.kind not in _BRIGHT:
+        raise ValueError(
+            f"brightest={brightest:g} has no effect on field kind {field.kind}. Leave it out, or "
+            "use field=zipnerf."
+        )
+    return dataclasses.replace(field, brightest=brightest)
 
 
 def _with_samples(model: ModelConfig, samples: tuple[int, ...], preset: str) -> ModelConfig:

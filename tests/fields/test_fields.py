@@ -91,6 +91,12 @@ def _see(name, gaussians, direction=None, params=None):
     return np.concatenate([np.atleast_1d(each) for each in seen])
 
 
+@pytest.mark.parametrize("brightest", [1.0, 2.0, 8.0])
+def test_colours_go_from_below_black_to_above_the_brightest(brightest):
+    ends = zipnerf.pad_colour(jnp.array([0.0, 1.0]), brightest=brightest)
+    np.testing.assert_allclose(ends, [-0.001, brightest + 0.001], rtol=1e-5)
+
+
 @pytest.mark.parametrize(
     ("raw", "expected"), [(1.0, np.log(2.0)), (101.0, 100.0), (-99.0, 0.0), (0.0, 0.3132617)]
 )

@@ -30,12 +30,15 @@ _ADDED_SINCE = {
         ("scene", "shading"),
         *(
             ("model", name)
-            for name in ("colour_network", "contraction", "near", "far", "sub_spaces")
+            for name in (
+                *("colour_network", "contraction", "near", "far", "sub_spaces"),
+                "brightest",
+            )
         ),
         *(("losses", name) for name in ("path_losses", "eikonal", "curvature")),
         ("schedule", "adam_b2"),
     ],
-    "model.json": [("config", "field", "colour_network")],
+    "model.json": [("config", "field", name) for name in ("colour_network", "brightest")],
 }
 
 _GEOMETRY = scenes.build(scenes.ball(1.3, subdivisions=2))

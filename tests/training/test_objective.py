@@ -490,3 +490,25 @@ def test_gains_of_black_and_of_glaring_pixels_stay_finite(extreme):
 def test_parameters_without_gains_say_so():
     with pytest.raises(ValueError, match="Train with exposure=per_image"):
         objective.gains(Params((), {}))
+
+
+def _error(linear, target):
+    """Returns the data loss of one pixel of equal channels."""
+    totals = objective.Totals(jnp.full((1, 3), linear), *jnp.zeros(3))
+    target, config = jnp.full((1, 3), target), LossConfig(hash_decay=0.0)
+    return objective.measure(Params((), {}), totals, target, jnp.zeros((1, 3)), config).loss
+
+
+@pytest.mark.parametrize(
+    ("linear", "target", "error"),
+    [
+        (4.0, 1.0, 0.0),  # a lamp
+        (1e4, 254.6 / 255.0, 0.0),
+        (4.0, 0.9, (1.055 * 4.0 ** (1.0 / 2.4) - 0.055 - 0.9) ** 2),  # too bright
+        (0.5, 1.0, (1.055 * 0.5 ** (1.0 / 2.4) - 0.055 - 1.0) ** 2),  # too dark for a lamp
+    ],
+)
+def test_only_saturated_pixels_may_be_brighter_than_they_look(linear, target, error):
+    value, slope = jax.value_and_grad(_error)(jnp.float32(linear), jnp.float32(target))
+    assert float(value) == pytest.approx(error, rel=1e-5, abs=1e-12)
+    assert np.isfinite(slope) and (float(slope) != 0.0) == (error != 0.0)

@@ -559,6 +559,24 @@ def test_a_skip_reaches_the_colour_network():
         assert made.model.config.field.colour_network == "skip"
 
 
+@pytest.mark.parametrize("field", ["zipnerf", "msnerf", "raydef", "rosenerf"])
+def test_light_above_white_reaches_the_field(field):
+    assert _resolve(_CLEAR, field=field).model.config.field.brightest == 1.0
+    assert _resolve(_CLEAR, field=field, brightest=2.0).model.config.field.brightest == 2.0
+
+
+@pytest.mark.parametrize("field", ["nerfacto", "neus"])
+def test_other_fields_have_no_light_above_white(field):
+    with pytest.raises(ValueError, match=rf"brightest=2 has no effect on field kind {field}"):
+        _resolve(_CLEAR, field=field, brightest=2.0)
+
+
+@pytest.mark.parametrize("brightest", [0.5, 9.0])
+def test_the_brightest_colour_is_at_least_white(brightest):
+    with pytest.raises(ValueError, match=r"brightest is .* Give 1 to 8"):
+        FieldConfig(brightest=brightest)
+
+
 def test_override_model_replaces_one_thing_an_option():
     asked = FieldConfig(
         samples_per_ray=(5, 4),
