@@ -50,6 +50,13 @@ _EXPOSURE = flags.DEFINE_enum(
     ["per_image", "fixed"],
     "Gain of each training image and channel: learned, or 1.",
 )
+_BRIGHTEST = flags.DEFINE_float(
+    "brightest",
+    1.0,
+    "Largest colour of the field, sRGB; above 1, such as 2, where lamps or windows shine.",
+    1.0,
+    8.0,
+)
 _RAYS_PER_PIXEL = cli_flags.rays_per_pixel(4)
 
 
@@ -68,6 +75,7 @@ def main() -> None:
         steps=_STEPS.value,
         far_field=_FAR_FIELD.value,
         exposure=_EXPOSURE.value,
+        brightest=_BRIGHTEST.value,
         rays_per_pixel=_RAYS_PER_PIXEL.value,
     )
     capture_steps.run(list(capture_steps.steps(source, out, options)), out)

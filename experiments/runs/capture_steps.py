@@ -27,6 +27,7 @@ class Options:
     steps: int | None = None
     far_field: str = "field"
     exposure: str = "per_image"
+    brightest: float = 1.0
     rays_per_pixel: int = 4
 
 
@@ -64,6 +65,7 @@ def steps(source: Path, out: Path, options: Options) -> Iterator[Step]:
         scene = refined
     training = [f"--scene={scene}", f"--out={model}", "--resume", f"--preset={options.preset}"]
     training += [f"--far_field={options.far_field}", f"--exposure={options.exposure}"]
+    training += [] if options.brightest == 1.0 else [f"--brightest={options.brightest:g}"]
     training += [] if options.steps is None else [f"--steps={options.steps}"]
     if options.meshes is None:
         report = found / "report.md"

@@ -64,6 +64,12 @@ def test_meshes_take_the_place_of_a_reconstruction(called, tmp_path):
     assert called[1][1]["scene"] == str(tmp_path / "imported")
 
 
+@pytest.mark.parametrize(("brightest", "asked"), [(1.0, None), (2.0, "2")])
+def test_light_above_white_is_asked_for_only_if_it_is_wanted(called, tmp_path, brightest, asked):
+    _run(tmp_path, brightest=brightest)
+    assert dict(called)["train"].get("brightest") == asked
+
+
 def test_other_options_than_before_are_refused_before_anything_runs(called, tmp_path):
     _run(tmp_path, steps=30)
     called.clear()
