@@ -43,6 +43,7 @@ from refref_jax.render.checkpoint_io import SavedModel
 from refref_jax.render.model import Model, ModelConfig, surface_of
 from refref_jax.training import fit, run_folder
 from refref_jax.training.config import TrainConfig, require
+from refref_jax.training.objective import SATURATED
 from refref_jax.training.resolve import Resolved, read_facts, resolve
 
 PRESET = "tiny"
@@ -160,8 +161,12 @@ def run(
 def _find_before_field(
     mesh: Mesh, model: Model, pixels: Photographs, start: float | None
 ) -> IndexEstimate:
-    """Searches for the index in front of a field."""
-    search = IndexSearch()
+    """Searches for the index in front of a field, whose colours are at most white.
+
+    Saturated pixels, which may be brighter, are left out if there are others.
+    """
+    search, dark = IndexSearch(), np.flatnonzero(np.all(pixels.rgb < SATURATED, axis=-1))
+    pixels = pixels.chosen(dark) if len(dark) else pixels
     evidence = Evidence(model.params, *jax.device_put((pixels.rays, pixels.rgb)))
     with ProgressBar("index", most_looks(search, start=start)) as bar:
         return estimate_index(

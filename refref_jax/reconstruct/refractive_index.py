@@ -50,6 +50,10 @@ REFLECTIONS = 3
 # hundredth anyway, and where the geometry is wrong a few rays see something else.
 _NOISE = 0.01
 
+# Largest error of a pixel, in sRGB: light that comes from where no photograph shows the background,
+# such as the roof of a room, is predicted at random.
+_CAP = 0.35
+
 
 class Evidence(NamedTuple):
     """Pixels, and the field that should explain them.
@@ -75,7 +79,7 @@ class Slope(NamedTuple):
 def errors(
     evidence: Evidence, scene: Scene, *, config: ModelConfig, settings: PathSettings = TRACING
 ) -> Float[Array, " rays"]:
-    """Returns the Charbonnier error of each pixel: of the length of its sRGB difference.
+    """Returns the Charbonnier error of each pixel: of its sRGB difference, capped at 0.35.
 
     Args:
       evidence: pixels and the field to compare with.
@@ -104,7 +108,7 @@ def errors(
         evidence.params, config, paths, jitter, rays=count, anneal=full_trust
     )
     difference = jnp.mean(jnp.square(seen.rgb - evidence.rgb), axis=-1)
-    return jnp.sqrt(difference + _NOISE**2) - _NOISE
+    return jnp.minimum(jnp.sqrt(difference + _NOISE**2) - _NOISE, _CAP)
 
 
 @functools.partial(jax.jit, static_argnames=("part", "config"))
