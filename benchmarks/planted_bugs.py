@@ -178,8 +178,8 @@ BUGS = (
     Bug(
         "shading normal sends rays to the wrong side",
         _STEP,
-        "normal = jnp.where(_keeps_sides(direction, shading, geometric, sides), shading,",
-        "normal = jnp.where(True, shading,",
+        "below = jnp.maximum(-numerics.dot(direction, geometric_normal), 0.0)",
+        "below = jnp.zeros_like(numerics.dot(direction, geometric_normal))",
         _TEST_STEP,
     ),
     Bug(

@@ -155,8 +155,9 @@ def conserving_share(
 def meet(surfaces: Surfaces, directions: np.ndarray, hits: Hits) -> Split:
     """Bends rays at their hits.
 
-    The triangle's own normal decides from which side a ray comes. Where the shading normal would
-    send either ray to the wrong side of the triangle, the triangle's own normal bends both.
+    The triangle's own normal decides from which side a ray comes, and bends it where the shading
+    normal points away from it. Rays that the shading normal would send to the wrong side of the
+    triangle are turned until they just leave it, at a hundredth of the sine.
     """
     corners = surfaces.corners[hits.triangles]
     u, v = hits.barycentrics.T
@@ -171,14 +172,11 @@ def meet(surfaces: Surfaces, directions: np.ndarray, hits: Hits) -> Split:
     inside, outside = surfaces.inside[part], surfaces.outside[part]
     near, far = np.where(entering, outside, inside), np.where(entering, inside, outside)
     geometric, shading = side * geometric, side * shading
-    smooth = _bend(directions, shading, near, far)
-    flat = _bend(directions, geometric, near, far)
-    total = smooth[0] == 1.0
-    good = (_dot(directions, shading) < 0.0) & (_dot(smooth[1], geometric) > 0.0)
-    good &= total | (_dot(smooth[2], geometric) < 0.0)
-    reflectance, reflected, refracted = (
-        np.where(good, a, b) for a, b in zip(smooth, flat, strict=True)
-    )
+    normals = np.where(_dot(directions, shading) < 0.0, shading, geometric)
+    reflectance, reflected, refracted = _bend(directions, normals, near, far)
+    up, down = _dot(reflected, geometric), _dot(refracted, geometric)
+    reflected = np.where(up < 0.0, unit(reflected - 1.01 * up * geometric), reflected)
+    refracted = np.where(down > 0.0, unit(refracted - 1.01 * down * geometric), refracted)
     return Split(np.einsum("ij,ijk->ik", blend, corners), reflectance[:, 0], reflected, refracted)
 
 

@@ -26,6 +26,10 @@ from refref_jax.optics.light_paths import Bend, PathStatus, RayDifferential, Sto
 from refref_jax.optics.media import Scene
 from refref_jax.optics.path_settings import PathSettings
 
+# Sine of the angle at which a ray that was turned leaves the triangle, as a share of that at which
+# it would have entered it.
+_BEYOND = 0.01
+
 
 class Interaction(NamedTuple):
     """Reflection and refraction of a ray at an interface.
@@ -67,8 +71,9 @@ def interact(
 ) -> Interaction:
     """Reflects and refracts a ray at an interface.
 
-    If the shading normal would send either ray to the wrong side of the triangle, the geometric
-    normal is used for both. On a rough surface, both rays leave one facet (see `fresnel`).
+    A ray that the shading normal would send to the wrong side of the triangle is turned until it
+    just leaves it. If the shading normal points away from the incident ray, the geometric normal is
+    used. On a rough surface, both rays leave one facet (see `fresnel`).
 
     Args:
       point: hit point of the ray.
@@ -83,7 +88,7 @@ def interact(
     outward = jnp.where(entering, 1.0, -1.0).astype(direction.dtype)
     geometric, shading = outward * point.geometric_normal, outward * point.shading_normal
 
-    normal = jnp.where(_keeps_sides(direction, shading, geometric, sides), shading, geometric)
+    normal = jnp.where(numerics.dot(direction, shading) < 0.0, shading, geometric)
     alpha = interfaces.alpha[point.part] if interfaces.alpha.shape[0] else None
     facet = normal
     if alpha is not None:
@@ -97,8 +102,10 @@ def interact(
         position=point.position,
         reflectance=fresnel.reflectance(beta, near, far),
         total=fresnel.transmission(beta, near, far).total,
-        reflected=numerics.renormalize(fresnel.reflect(direction, facet)),
-        transmitted=numerics.renormalize(fresnel.refract(direction, facet, near, far)),
+        reflected=_on_side(numerics.renormalize(fresnel.reflect(direction, facet)), geometric),
+        transmitted=_on_side(
+            numerics.renormalize(fresnel.refract(direction, facet, near, far)), -geometric
+        ),
         restart_reflected=numerics.offset_origin(point.position, geometric, point.scale),
         restart_transmitted=numerics.offset_origin(point.position, -geometric, point.scale),
         sides=sides,
@@ -155,23 +162,14 @@ def _unmasked(
     return shares.at[1].set(jnp.where(met.sides.kind == media.THIN_SHEET, 1.0, shares[1]))
 
 
-def _keeps_sides(
-    direction: Float[Array, "3"],
-    shading: Float[Array, "3"],
-    geometric: Float[Array, "3"],
-    sides: media.Crossing,
-) -> Bool[Array, ""]:
-    """Returns whether the shading normal sends both rays to the correct side of the triangle."""
-    near, far = sides.index_near, sides.index_far
-    beta = -numerics.dot(direction, shading)
-    total = fresnel.transmission(beta, near, far).total
-    reflected = fresnel.reflect(direction, shading)
-    refracted = fresnel.refract(direction, shading, near, far)
-    return (
-        (beta > 0.0)
-        & (numerics.dot(reflected, geometric) > 0.0)
-        & (total | (numerics.dot(refracted, geometric) < 0.0))
-    )
+def _on_side(
+    direction: Float[Array, "3"], geometric_normal: Float[Array, "3"]
+) -> Float[Array, "3"]:
+    """Returns a unit direction, turned just to the side that a normal points to."""
+    below = jnp.maximum(-numerics.dot(direction, geometric_normal), 0.0)
+    # The length of the sum, which is 0 only for the opposite of the normal.
+    squared = 1.0 - (1.0 - _BEYOND**2) * jnp.square(below)
+    return (direction + (1.0 + _BEYOND) * below * geometric_normal) / jnp.sqrt(squared)
 
 
 class Shares(NamedTuple):

@@ -65,6 +65,44 @@ def test_no_ray_leaves_on_the_wrong_side_however_the_shading_normal_leans(lean, 
     assert 0.0 <= met.reflectance <= 1.0
 
 
+@pytest.mark.parametrize("degrees", [7.0, 9.0, 11.0])
+def test_a_ray_that_would_cross_the_triangle_is_turned_as_little_as_needed(degrees):
+    incident = np.array([1.0, 0.3, -0.2]) / np.linalg.norm([1.0, 0.3, -0.2])
+    shading = np.array([np.sin(np.radians(degrees)), 0.0, np.cos(np.radians(degrees))])
+    mirrored = incident - 2.0 * (incident @ shading) * shading
+    assert incident @ shading < 0.0 and mirrored[2] < 0.0
+    turned = mirrored * [1.0, 1.0, -0.01]
+    met = _meet(incident, shading=shading)
+    np.testing.assert_allclose(met.reflected, turned / np.linalg.norm(turned), atol=1e-6)
+
+
+def test_a_shading_normal_that_points_away_from_the_ray_is_not_used():
+    flat, leaning = _meet([1.0, 0.3, -0.2]), _meet([1.0, 0.3, -0.2], shading=(0.3, 0.0, 1.0))
+    np.testing.assert_array_equal(flat.reflected, leaning.reflected)
+    np.testing.assert_array_equal(flat.transmitted, leaning.transmitted)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 7.0, 11.3])
+def test_slopes_are_finite_where_a_ray_is_turned(degrees):
+    lean = np.radians(degrees)
+
+    def turned(shading):
+        point = SurfacePoint(
+            position=jnp.zeros(3),
+            geometric_normal=jnp.array([0.0, 0.0, 1.0]),
+            shading_normal=shading,
+            part=jnp.int32(0),
+            scale=jnp.float32(1.0),
+        )
+        direction = jnp.array([1.0, 0.0, -0.2]) / np.hypot(1.0, 0.2)
+        nowhere = media.empty_interior_list(_GLASS)
+        met = path_step.interact(point, _GLASS, nowhere, direction)
+        return jnp.sum(met.reflected * jnp.array([1.0, 2.0, 3.0])) + met.transmitted[2]
+
+    slope = jax.grad(turned)(jnp.array([np.sin(lean), 0.0, np.cos(lean)], jnp.float32))
+    assert np.all(np.isfinite(slope))
+
+
 def test_the_shading_normal_bends_the_ray():
     flat, leaning = _meet([0.2, 0.0, -1.0]), _meet([0.2, 0.0, -1.0], shading=(0.1, 0.0, 1.0))
     assert np.linalg.norm(flat.transmitted - leaning.transmitted) > 0.02
