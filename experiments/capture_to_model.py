@@ -53,7 +53,7 @@ _EXPOSURE = flags.DEFINE_enum(
 _BRIGHTEST = flags.DEFINE_float(
     "brightest",
     1.0,
-    "Largest colour of the field, sRGB; above 1, such as 2, where lamps or windows shine.",
+    "Largest linear radiance of the field; above 1 (white), such as 2, where lamps shine.",
     1.0,
     8.0,
 )

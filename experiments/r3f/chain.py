@@ -60,12 +60,12 @@ def reconstruct(
     with atomic_files.hold(out):
         found = records.read(out)  # another process may have finished it meanwhile
         scene = field_surface.masked_scene(scene, out, config)
-        if found.geometry is None or not geometry_stage.is_there(out, found.geometry):
+        families = _takes_families(scene, out, config)
+        if not _has_surface(out, found, families):
             read = "images" if config.geometry in field_surface.NAMES else "masks"
             say(f"geometry: {config.geometry} of the training {read}, {config.resolution} cells")
             if without := _views_without_object(scene):
                 say(f"geometry: {without} training views are left out, whose masks mark no object")
-            families = config.refinement == "light" and not _has_backdrop(scene, out, config)
             facts = geometry_stage.run(scene, out, config, families=families)
             found = dataclasses.replace(found, geometry=facts, index=None, light=None, report=None)
             records.write(out, found)
@@ -225,16 +225,20 @@ def _refined(scene: Path, out: Path, found: Reconstruction, say: Say) -> Reconst
     return found
 
 
-def _has_backdrop(scene: Path, out: Path, config: ReconstructionConfig) -> bool:
-    """Returns whether the background is a surface before which light can refine a shape."""
-    return index_stage.has_backdrop(
-        scene,
-        out / _INDEX_FOLDER,
-        seed=config.seed,
-        space=config.space,
-        radius=config.radius,
-        centre=config.centre,
-    )
+def _has_surface(out: Path, found: Reconstruction, families: bool) -> bool:
+    """Returns whether the surface is there, and was made with or without families, as wanted."""
+    facts = found.geometry
+    if facts is None or facts.families not in (None, families):
+        return False
+    return geometry_stage.is_there(out, facts)
+
+
+def _takes_families(scene: Path, out: Path, config: ReconstructionConfig) -> bool:
+    """Returns whether outlines are to choose a family of shapes: light cannot, before a field."""
+    if config.refinement != "light" or config.geometry in field_surface.NAMES:
+        return False
+    bounds = {"space": config.space, "radius": config.radius, "centre": config.centre}
+    return not index_stage.has_backdrop(scene, out / _INDEX_FOLDER, seed=config.seed, **bounds)
 
 
 def _light(scene: Path, out: Path, found: Reconstruction) -> LightFacts:

@@ -15,7 +15,7 @@ from experiments.r3f.records import GeometryFacts, ReconstructionConfig
 from refref_jax import atomic_files
 from refref_jax.data import meshes, scene_folder, scene_names
 from refref_jax.geometry.triangle_meshes import Mesh, diameter, volume
-from refref_jax.reconstruct import occupancy
+from refref_jax.reconstruct import ReconstructionError, occupancy
 from refref_jax.reconstruct.grids import Grid, find_isosurface
 from refref_jax.reconstruct.masks import Views, carve
 from refref_jax.reconstruct.mesh_distance import carved_alone, silhouette_overlap, without_outliers
@@ -95,7 +95,7 @@ def run(
       scene: folder of the scene.
       out: folder of the reconstruction.
       config: options of the reconstruction.
-      families: whether the outlines may choose a family of shapes, as where no light can.
+      families: whether families of shapes are fitted to the outlines, as where light cannot refine.
 
     Raises:
       ValueError: if there are no masks, or no object fits them.
@@ -107,11 +107,14 @@ def run(
     trusted = without_outliers(cut, views, config.outliers)
     refined = refine(cut, Refinement(), views=trusted)
     befores = [cut, *(stage.mesh for stage in refined)]
-    mesh = befores[-1]
-    first = refined[0].mesh  # not smoothed yet
-    chosen = shape_from_outlines(first, trusted, seed=config.seed) if families else None
-    if chosen is not None:
-        mesh = chosen.mesh
+    mesh, chosen = befores[-1], None
+    refused = [f"{stage.name}: {stage.refused}" for stage in refined if stage.refused]
+    if families:
+        try:
+            chosen = shape_from_outlines(mesh, trusted, carved=befores[1], seed=config.seed)
+        except ReconstructionError as error:
+            refused.append(f"families of shapes: {error}")
+        mesh = mesh if chosen is None else chosen.mesh
     name = f"{_object(scene)}_{MATERIAL}.ply"
     with atomic_files.written_folder(out / FOLDER) as folder:
         meshes.write_mesh(folder / name, *mesh)
@@ -125,9 +128,10 @@ def run(
                 for before, stage in zip(befores, refined, strict=False)
                 if not np.array_equal(before.vertices, stage.mesh.vertices)
             ),
-            *(() if chosen is None else (f"{chosen.name} by its outlines",)),
+            *(() if chosen is None else (f"fitted to outlines as {chosen.name}",)),
         ),
-        refused=tuple(f"{stage.name}: {stage.refused}" for stage in refined if stage.refused),
+        refused=tuple(refused),
+        families=families,
         warnings=(
             *field_surface.warnings(scene, out),
             *about_masks(mesh, views, names, outliers=config.outliers),
@@ -142,6 +146,7 @@ def describe(
     *,
     stages: tuple[str, ...],
     refused: tuple[str, ...] = (),
+    families: bool = False,
     warnings: tuple[str, ...] = (),
 ) -> GeometryFacts:
     """Returns the facts of a surface.
@@ -152,6 +157,7 @@ def describe(
       views: masks of the object.
       stages: names of the stages that changed it.
       refused: skipped stages, and the reasons.
+      families: whether families of shapes were fitted to the outlines.
       warnings: warnings about masks.
     """
     return GeometryFacts(
@@ -166,6 +172,7 @@ def describe(
         stages=stages,
         refused=refused,
         warnings=warnings,
+        families=families,
     )
 
 

@@ -79,6 +79,7 @@ class GeometryFacts:
       stages: names of the refinement stages that changed the mesh.
       refused: skipped stages, and the reasons.
       warnings: warnings about masks.
+      families: whether families of shapes were fitted to the outlines; `None` in older records.
     """
 
     mesh: str
@@ -92,6 +93,7 @@ class GeometryFacts:
     stages: tuple[str, ...]
     refused: tuple[str, ...]
     warnings: tuple[str, ...] = dataclasses.field(metadata={configuration.FORMERLY: "doubts"})
+    families: bool | None = None
 
 
 @dataclasses.dataclass(frozen=True)

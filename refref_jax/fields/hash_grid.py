@@ -221,7 +221,7 @@ class GridRadianceConfig(RadianceConfig):
       colour_width: width of the colour network's hidden layers.
       colour_depth: number of hidden layers of the colour network.
       colour_network: `skip` appends the colour network's inputs to the outputs of its first layer.
-      brightest: largest colour, sRGB; above 1 where lamps or windows shine.
+      brightest: largest linear radiance; above 1 (white) where lamps or windows shine.
     """
 
     grid: HashGridConfig

@@ -1,12 +1,13 @@
-"""Which of several fitted models to keep: the smallest one that held-out views do not refuse.
+"""Which of several fitted models to keep: the smallest one that held-out views do not reject.
 
 A `Trial` is a model that was fitted, with the errors of pixels that it was not fitted to. Errors of
 one view are alike, so views are what is counted: one trial is worse than another if the mean of the
 differences of their views' errors is above two standard errors.
 
 `shape_from_outlines` fits families to the outlines of masks alone, for objects that no light can
-refine. Masks that are wrong by a pixel or two make the body that they carve too small, and rough;
-a family has so few unknowns that their errors average out, and knows the side that no view shows.
+refine. Masks that are wrong by a pixel or two carve a body that is too small and rough; a family
+has so few unknowns that their errors average out, and it knows the side that no view shows. A
+family that lacks a part which the masks show, such as a handle, is rejected.
 """
 
 import math
@@ -15,13 +16,14 @@ from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 import scipy.sparse
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from scipy.ndimage import distance_transform_edt
 
-from refref_jax.geometry.triangle_meshes import Mesh
+from refref_jax.geometry.triangle_meshes import Mesh, pieces
 from refref_jax.reconstruct import families, gauss_newton
 from refref_jax.reconstruct.gauss_newton import Candidate, Fit, Model
-from refref_jax.reconstruct.masks import Views, views_at
-from refref_jax.reconstruct.mesh_distance import silhouette_overlap
+from refref_jax.reconstruct.masks import Views, overlaps, views_at
+from refref_jax.reconstruct.mesh_distance import silhouettes
 from refref_jax.reconstruct.outlines import Outlines
 from refref_jax.reconstruct.photometry import Backdrop, Photographs
 from refref_jax.reconstruct.polyhedra import fit_polyhedron
@@ -45,8 +47,12 @@ _NEAR_OUTLINES = 0.12
 # Pixels by which corners of a polyhedron stick out.
 _TOLERANCES = (4.0, 2.0, 1.0)
 
+# Pixels by which silhouette and mask may differ in a view; by how much more than those of the mesh:
+# half as much again, and one pixel.
+_MOST_APART, _APART_SHARE, _APART_MORE = 4.0, 1.5, 1.0
+
 # One view in this many judges shapes that are fitted to outlines. Distances beyond which outlines
-# have no say, in pixels, and steps with each. Largest error of a shape, as a share of the least.
+# are ignored, in pixels, and steps with each. Largest error of a shape, as a share of the least.
 _JUDGE_EVERY, _REACHES, _OUTLINE_STEPS, _AS_GOOD = 5, (6.0, 3.0), 8, 1.05
 
 # Largest error of a hypothesis that might be true as well, relative to that of the chosen one.
@@ -63,7 +69,7 @@ class ObjectModel(Model, Protocol):
 
 @runtime_checkable
 class Judged(Protocol):
-    """What was fitted, and how views that it was not fitted to refuse it."""
+    """What was fitted, and its errors in views that judge it."""
 
     @property
     def unknowns(self) -> int:
@@ -213,15 +219,16 @@ class OutlineTrial(NamedTuple):
 
     Attributes:
       shape: the shape.
-      x: its unknowns.
-      unknowns: their number; that of the vertices for the mesh from masks.
+      unknowns: their number; that of the coordinates for a mesh from masks.
       by_view: share of mask and silhouette of each judging view that is not in both.
+      apart: median over these views of the largest distance, in pixels, of a pixel of the mask from
+        the silhouette, or the reverse.
     """
 
     shape: Shape
-    x: Unknowns
     unknowns: int
     by_view: Float[np.ndarray, " views"]
+    apart: float
 
 
 class FamilyFit(NamedTuple):
@@ -231,47 +238,77 @@ class FamilyFit(NamedTuple):
     mesh: Mesh
 
 
-def shape_from_outlines(mesh: Mesh, views: Views, *, seed: int = 0) -> FamilyFit | None:
-    """Returns the smallest family of shapes that the outlines of masks do not refuse.
+def shape_from_outlines(
+    mesh: Mesh, views: Views, *, carved: Mesh | None = None, seed: int = 0
+) -> FamilyFit | None:
+    """Returns the smallest family of shapes that the outlines of masks do not reject.
 
     The families are fitted to four views in five; the others judge them and the mesh, by how much
-    of mask and silhouette is not in both (`choose`, of those within 5 % of the best). The one that
-    is kept is fitted to all views. Polyhedra have the corners that stick out of the outlines.
+    of mask and silhouette is not in both (`choose`, of those within 5 % of the best). The mesh was
+    made of all masks, which is to its advantage. The family that is kept is fitted to all views.
+    Polyhedra have the corners that stick out of the outlines.
 
     Args:
-      mesh: closed mesh of the object, from masks; not smoothed, or corners are rounded.
+      mesh: closed mesh of the object, from masks.
       views: these masks and their cameras.
+      carved: the mesh before it was smoothed, which rounds its corners.
       seed: seed of the draws of points.
 
     Returns:
-      `None` if the mesh is better than any family.
+      `None` if the mesh is better than any family, if it has several pieces, or if there are too
+      few masks with an outline.
 
     Raises:
       ReconstructionError: if the mesh is empty, flat, inside out or not finite, or
         scikit-image is not installed.
     """
+    carved = mesh if carved is None else carved
+    outlined = np.flatnonzero([mask.any() and not mask.all() for mask in views.masks])
+    views = views_at(views, outlined)
     judging = np.arange(len(views.masks)) % _JUDGE_EVERY == 0
     fitted, judges = (views_at(views, each) for each in (~judging, judging))
-    if not len(fitted.masks):
+    if not len(fitted.masks) or len(np.unique(pieces(mesh.faces, len(mesh.vertices)))) > 1:
         return None
-
-    def trial(shape: Shape, unknowns: int) -> OutlineTrial:
-        x = fit_to_outlines(shape, fitted, seed=seed)
-        missed = 1.0 - silhouette_overlap(mesh_of(shape.pose(x)), *judges)
-        return OutlineTrial(shape, x, unknowns, missed)
-
-    *shapes, _ = families.candidates(mesh, furthest=_NEAR_OUTLINES)
-    bodies = (fit_polytope(mesh, fitted, tolerance=each) for each in _TOLERANCES)
-    polyhedra = [None if body is None else fit_polyhedron(body) for body in bodies]
-    shapes = [*shapes, *(each for each in polyhedra if each is not None)]
-    trials = [trial(shape, len(shape.start())) for shape in shapes]
-    trials.append(trial(FixedShape(mesh), mesh.vertices.size))
+    whole = _judged_by_masks(FixedShape(mesh), mesh, judges)
+    allowed = min(_MOST_APART, _APART_SHARE * whole.apart + _APART_MORE)
+    trials = [whole]
+    for shape in _near_outlines(carved, fitted):
+        found = mesh_of(shape.pose(fit_to_outlines(shape, fitted, seed=seed)))
+        trial = _judged_by_masks(shape, found, judges)
+        trials += [trial] if trial.apart <= allowed else []
     most = _AS_GOOD * min(each.by_view.mean() for each in trials)  # few views cannot tell
     chosen = choose([each for each in trials if each.by_view.mean() <= most], level=0.0)
-    if isinstance(chosen.shape, FixedShape):
+    if chosen is whole:
         return None
     x = fit_to_outlines(chosen.shape, views, seed=seed)
     return FamilyFit(chosen.shape.name, mesh_of(chosen.shape.pose(x)))
+
+
+def _near_outlines(carved: Mesh, views: Views) -> list[Shape]:
+    """Returns the families that may explain the outlines of an object."""
+    *near, _ = families.candidates(carved, furthest=_NEAR_OUTLINES)
+    bodies = (fit_polytope(carved, views, tolerance=each) for each in _TOLERANCES)
+    polyhedra = [None if body is None else fit_polyhedron(body) for body in bodies]
+    return [*near, *(each for each in polyhedra if each is not None)]
+
+
+def _judged_by_masks(shape: Shape, mesh: Mesh, judges: Views) -> OutlineTrial:
+    """Returns a shape whose surface is `mesh`, with its errors in views that judge it."""
+    seen = silhouettes(mesh, judges.cameras)
+    unknowns = mesh.vertices.size if isinstance(shape, FixedShape) else len(shape.start())
+    apart = [_distance_between(*pair) for pair in zip(seen, judges.masks, strict=True)]
+    missed = 1.0 - overlaps(seen, judges.masks)
+    return OutlineTrial(shape, unknowns, missed, float(np.median(apart)))
+
+
+def _distance_between(seen: Bool[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"]) -> float:
+    """Returns the largest distance of a pixel of one area from the other, in pixels."""
+    if not seen.any() or not mask.any():
+        return math.inf
+    return max(
+        float(distance_transform_edt(~area)[other].max())
+        for area, other in ((seen, mask), (mask, seen))
+    )
 
 
 def fit_to_outlines(shape: Shape, views: Views, *, seed: int = 0) -> Unknowns:

@@ -214,6 +214,8 @@ def fit_corners(mesh: Mesh, candidates: Mesh, views: Views, *, most: int = MOST)
         )
     try:
         corners = _find(hull(candidates).vertices, views, most)
+        if len(corners) > most:
+            raise ReconstructionError(f"More than {most} corners stick out. Keep the mesh.")
         body = weigh_facets(of_points(corners))
     except QhullError as error:
         raise ReconstructionError(
@@ -231,7 +233,7 @@ def fit_corners(mesh: Mesh, candidates: Mesh, views: Views, *, most: int = MOST)
 def fit_polytope(candidates: Mesh, views: Views, *, tolerance: float) -> Mesh | None:
     """Returns the hull of the corners that stick out of the outlines by more than a tolerance.
 
-    Masks whose edges are wrong by a pixel or two have many corners that the object has not; a
+    Masks whose edges are wrong by a pixel or two have many corners that the object lacks; a
     tolerance of twice as much leaves those of the object.
 
     Args:
@@ -255,7 +257,10 @@ def fit_polytope(candidates: Mesh, views: Views, *, tolerance: float) -> Mesh | 
 def _find(
     points: Points, views: Views, most: int, *, tolerances: Sequence[float] = _TOLERANCES
 ) -> Corners:
-    """Returns the corners for the finest tolerance that needs at most `most` of them."""
+    """Returns the corners for the finest tolerance that needs at most `most` of them.
+
+    They are more if the first tolerance needs more.
+    """
     images = [signed_distances(mask).astype(np.float32) for mask in views.masks]
     points = points[_on_outlines(points, views)]
     directions = np.random.default_rng(0).normal(size=(_FIRST, 3))
@@ -264,7 +269,7 @@ def _find(
     for tolerance in tolerances:
         more = _insert(corners, points, views, tolerance, most)
         if len(more) > most:
-            break
+            return corners if require else more
         if not require or len(more) > len(corners):
             more = _move(more, views, images)
         corners = _prune(more, views, tolerance)

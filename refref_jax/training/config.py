@@ -179,7 +179,7 @@ class FieldConfig:
         none.
       colour_network: Layers of the colour network: plain, or with a skip connection (skip), which
         appends its inputs to the outputs of its first layer, as in the paper's released code.
-      brightest: Largest colour of the radiance field, sRGB; above 1 where lamps or windows shine.
+      brightest: Largest linear radiance of the field; above 1 (white) where lamps or windows shine.
       contraction: Scenes whose space is contracted: unbounded ones, or all (always; the paper's
         released code), as if the size of their background were unknown.
       near: Near plane: distance of the first sample from the camera, world units; by default 0.05,

@@ -65,6 +65,7 @@ def test_a_ball_on_a_table_is_found_in_masks_whose_edges_are_wrong():
     assert away == pytest.approx(_RADIUS, rel=0.015)
 
 
+@pytest.mark.slow
 def test_a_box_on_a_table_has_its_six_planes():
     views = _views_from_above(_turned_box, pixels=2.0)
     found = model_selection.shape_from_outlines(_carved(views), views)
@@ -75,9 +76,37 @@ def test_a_box_on_a_table_has_its_six_planes():
     assert away.max() < 0.06  # a pixel is 0.027 there
 
 
+@pytest.mark.slow
 def test_an_object_of_no_family_stays_as_it_is():
     views = _views_from_above(_lump, pixels=0.5)
     assert model_selection.shape_from_outlines(_carved(views), views) is None
+
+
+def _mug(points):
+    """A cylinder with a handle."""
+    turned = np.hypot(points[..., 0], points[..., 1]) - 0.6
+    cup = np.maximum(turned, np.abs(points[..., 2]) - 0.7)
+    ring = np.hypot(np.hypot(points[..., 0] - 0.6, points[..., 2]) - 0.4, points[..., 1]) - 0.1
+    return np.minimum(cup, ring)
+
+
+@pytest.mark.slow
+def test_a_handle_is_no_noise():
+    views = _views_from_above(_mug, pixels=1.5)
+    found = model_selection.shape_from_outlines(_carved(views), views)
+    assert found is None or np.ptp(found.mesh.vertices[:, 0]) > 1.5
+
+
+def test_several_pieces_are_no_family():
+    views = _views_from_above(_ball, pixels=0.0)
+    two = bodies.joined(bodies.icosphere(), bodies.icosphere(radius=0.2, centre=(1.4, 0.0, 0.0)))
+    assert model_selection.shape_from_outlines(two, views) is None
+
+
+def test_full_masks_have_no_outline():
+    cameras = bodies.cameras_around(8, size=24, distance=3.2)
+    views = Views(np.ones((8, 24, 24), bool), cameras)
+    assert model_selection.shape_from_outlines(bodies.icosphere(), views) is None
 
 
 def test_one_view_cannot_judge():
@@ -100,12 +129,12 @@ def test_a_mesh_has_no_unknowns_to_fit():
     assert fit_to_outlines(FixedShape(bodies.icosphere()), views).shape == (0,)
 
 
-def test_the_smallest_shape_that_views_do_not_refuse_is_kept():
+def test_the_smallest_shape_that_views_do_not_reject_is_kept():
     mesh = FixedShape(bodies.icosphere())
     errors = np.array([0.04, 0.05, 0.06, 0.05])
     noise = 0.004 * np.array([1.0, -1.0, -1.0, 1.0])
-    best = OutlineTrial(mesh, np.zeros(0), 900, errors)
-    as_good = OutlineTrial(mesh, np.zeros(0), 4, errors + 0.001 + noise)
-    worse = OutlineTrial(mesh, np.zeros(0), 3, errors + 0.01 + noise)
+    best = OutlineTrial(mesh, 900, errors, apart=1.0)
+    as_good = OutlineTrial(mesh, 4, errors + 0.001 + noise, apart=1.0)
+    worse = OutlineTrial(mesh, 3, errors + 0.01 + noise, apart=1.0)
     assert model_selection.choose([best, as_good, worse], level=0.0) is as_good
     assert model_selection.choose([best, as_good, worse], level=0.02) is worse

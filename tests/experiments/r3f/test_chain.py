@@ -314,6 +314,7 @@ def _stub_light(monkeypatch, *, after, growth=1.001, index=1.51):
     monkeypatch.setattr(light_stage, "fit", fit)
     monkeypatch.setattr(light_figures, "draw", lambda path, *_: path.write_bytes(b"figure"))
     monkeypatch.setattr(light_stage, "look_at_ends", lambda *_, **options: _SHAPELESS)
+    monkeypatch.setattr(index_stage, "has_backdrop", lambda *args, **options: True)
     monkeypatch.setattr(index_stage, "learn_backdrop", lambda *_, **options: "surface")
     return called
 
