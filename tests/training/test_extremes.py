@@ -168,13 +168,25 @@ def test_a_perfect_batch_has_an_infinite_psnr_that_harms_nothing():
 
 
 @_each_precision
-@pytest.mark.parametrize(("raw", "target"), [(8.0, 255), (-8.0, 0)])
-def test_colours_beyond_what_an_image_holds_are_drawn_back(raw, target, precision):
+def test_colours_below_black_are_drawn_back(precision):
     case = _case("field", precision)
-    beyond = extremes.with_colour(extremes.parameters(case[1])["trained"], raw)
+    beyond = extremes.with_colour(extremes.parameters(case[1])["trained"], -8.0)
+    gradient, moved, _ = _step(case, "all missed", beyond, 0)
+    assert np.all(extremes.colour_bias(gradient) < 0.0)
+    assert np.all(extremes.colour_bias(moved) > -8.0)
+
+
+@_each_precision
+@pytest.mark.parametrize(("target", "drawn_back"), [(255, False), (250, True)])
+def test_colours_above_white_are_drawn_back_unless_a_pixel_is_saturated(
+    target, drawn_back, precision
+):
+    case = _case("field", precision)
+    beyond = extremes.with_colour(extremes.parameters(case[1])["trained"], 9.0)
     gradient, moved, _ = _step(case, "all missed", beyond, target)
-    assert np.all(np.sign(extremes.colour_bias(gradient)) == np.sign(raw))
-    assert np.all(np.abs(extremes.colour_bias(moved)) < abs(raw))
+    assert np.all(extremes.colour_bias(gradient) >= 0.0)
+    assert np.all((extremes.colour_bias(gradient) > 0.0) == drawn_back)
+    assert np.all(extremes.colour_bias(moved) <= 9.0)
 
 
 @_each_precision
