@@ -97,7 +97,7 @@ class Radiance(NamedTuple):
 
     Attributes:
       density: density per scene radius, non-negative.
-      rgb: linear radiance towards the camera, in `[-0.001, 1.001]`, or up to `brightest`.
+      rgb: linear radiance towards the camera, in `[-0.001, brightest + 0.001]`, where white is 1.
     """
 
     density: Float[Array, ""]

@@ -102,19 +102,20 @@ def interact(
         position=point.position,
         reflectance=fresnel.reflectance(beta, near, far),
         total=fresnel.transmission(beta, near, far).total,
-        reflected=_on_side(numerics.renormalize(fresnel.reflect(direction, facet)), geometric),
-        transmitted=_on_side(
-            numerics.renormalize(fresnel.refract(direction, facet, near, far)), -geometric
-        ),
+        reflected=numerics.renormalize(fresnel.reflect(direction, facet)),
+        transmitted=numerics.renormalize(fresnel.refract(direction, facet, near, far)),
         restart_reflected=numerics.offset_origin(point.position, geometric, point.scale),
         restart_transmitted=numerics.offset_origin(point.position, -geometric, point.scale),
         sides=sides,
         radiance=point.radiance,
     )
     met = _at_other_kinds(met, interfaces, direction, beta)
-    if alpha is None:
-        return met
-    return met._replace(unmasked=_unmasked(met, direction, normal, alpha))
+    if alpha is not None:  # light that a facet sends to the wrong side is hidden, and not turned
+        met = met._replace(unmasked=_unmasked(met, direction, normal, alpha))
+    return met._replace(
+        reflected=_on_side(met.reflected, geometric),
+        transmitted=_on_side(met.transmitted, -geometric),
+    )
 
 
 def _at_other_kinds(
@@ -167,7 +168,7 @@ def _on_side(
 ) -> Float[Array, "3"]:
     """Returns a unit direction, turned just to the side that a normal points to."""
     below = jnp.maximum(-numerics.dot(direction, geometric_normal), 0.0)
-    # The length of the sum, which is 0 only for the opposite of the normal.
+    # The squared length of the sum, at least that for the opposite of the normal.
     squared = 1.0 - (1.0 - _BEYOND**2) * jnp.square(below)
     return (direction + (1.0 + _BEYOND) * below * geometric_normal) / jnp.sqrt(squared)
 

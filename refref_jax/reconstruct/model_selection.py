@@ -47,8 +47,8 @@ _NEAR_OUTLINES = 0.12
 # Pixels by which corners of a polyhedron stick out.
 _TOLERANCES = (4.0, 2.0, 1.0)
 
-# Pixels by which silhouette and mask may differ in a view; by how much more than those of the mesh:
-# half as much again, and one pixel.
+# Largest distance of silhouette and mask in the median view, in pixels: the smaller of a fixed one
+# and of 1.5 times that of the mesh from masks plus 1.
 _MOST_APART, _APART_SHARE, _APART_MORE = 4.0, 1.5, 1.0
 
 # One view in this many judges shapes that are fitted to outlines. Distances beyond which outlines

@@ -7,8 +7,8 @@ sums over all of them.
 Rendered colours are compared without clipping: colours below black or above white have gradients
 that move them back, and black pixels have the slope 12.92 of the transfer function (see
 `render.pixels`). Only saturated pixels may be brighter than they look: a brighter colour has no
-error there. Fields return colours in `[-0.001, 1.001]`, or more where lamps are seen, so that their
-sigmoid has a non-zero slope at black and white.
+error there. Fields return colours in `[-0.001, brightest + 0.001]`, so that their sigmoid has a
+non-zero slope at black and white.
 
 Symbols: `s` is the normalised distance along a path, `w` its weights (see `sampling.stepfun`).
 """
@@ -279,7 +279,7 @@ def measure(
 
 
 def _as_seen(rgb: Float[Array, "rays 3"], target: Float[Array, "rays 3"]) -> Float[Array, "rays 3"]:
-    """Returns sRGB colours as a camera shows them that saturates in some pixels."""
+    """Returns sRGB colours as a camera that saturates records them: the target at most, there."""
     return jnp.where((target >= SATURATED) & (rgb > target), target, rgb)
 
 

@@ -140,3 +140,25 @@ def test_a_reflection_that_is_not_followed_leaves_its_share(reflections, first, 
 def test_below_the_threshold_the_stronger_branch_takes_all(reflectance, strength, expected):
     found = _shares(reflectance, strength=strength, reflections="all", min_throughput=0.1)
     assert found == [expected, 1.0 - expected]
+
+
+def test_light_that_a_facet_sends_to_the_wrong_side_is_hidden():
+    """It is not turned into light that leaves, as that of a leaning shading normal is."""
+    rough = _GLASS._replace(alpha=jnp.array([0.5], jnp.float32))
+    point = SurfacePoint(
+        position=jnp.zeros(3),
+        geometric_normal=jnp.array([0.0, 0.0, 1.0]),
+        shading_normal=jnp.array([0.0, 0.0, 1.0]),
+        part=jnp.int32(0),
+        scale=jnp.float32(1.0),
+    )
+    nowhere = media.empty_interior_list(rough)
+    hidden = 0
+    for slope in np.linspace(-2.0, 2.0, 21):
+        direction = jnp.array([1.0, 0.0, -0.3]) / np.hypot(1.0, 0.3)
+        met = path_step.interact(
+            point, rough, nowhere, direction, tilt=jnp.array([slope, 0.0], jnp.float32)
+        )
+        assert met.reflected[2] > 0.0 > met.transmitted[2] or met.total
+        hidden += bool(met.unmasked[0] == 0.0)
+    assert 0 < hidden < 21
