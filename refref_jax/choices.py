@@ -14,6 +14,9 @@ CLEAR: Colour = (1.0, 1.0, 1.0)
 NO_ABSORPTION: Colour = (0.0, 0.0, 0.0)
 """Absorption of a clear medium."""
 
+SATURATED = 254.5 / 255.0
+"""Colour, sRGB, from which on an 8-bit pixel is saturated: the light may be brighter."""
+
 Position = tuple[float, float, float]
 """A point in world units."""
 

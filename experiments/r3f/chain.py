@@ -234,7 +234,7 @@ def _has_surface(out: Path, found: Reconstruction, families: bool) -> bool:
 
 
 def _takes_families(scene: Path, out: Path, config: ReconstructionConfig) -> bool:
-    """Returns whether outlines are to choose a family of shapes: light cannot, before a field."""
+    """Returns whether outlines choose a family of shapes: in front of a field, light cannot."""
     if config.refinement != "light" or config.geometry in field_surface.NAMES:
         return False
     bounds = {"space": config.space, "radius": config.radius, "centre": config.centre}

@@ -21,7 +21,7 @@ from experiments.cli import app
 from experiments.cli.progress import ProgressBar
 from experiments.figures import style
 from experiments.figures.style import COLOURS, pyplot
-from refref_jax.choices import Position, Space, Split
+from refref_jax.choices import SATURATED, Position, Space, Split
 from refref_jax.data import image_files, scene_folder
 from refref_jax.data.scene_assembly import assemble_scene
 from refref_jax.geometry.cameras import pixel_rays
@@ -43,7 +43,6 @@ from refref_jax.render.checkpoint_io import SavedModel
 from refref_jax.render.model import Model, ModelConfig, surface_of
 from refref_jax.training import fit, run_folder
 from refref_jax.training.config import TrainConfig, require
-from refref_jax.training.objective import SATURATED
 from refref_jax.training.resolve import Resolved, read_facts, resolve
 
 PRESET = "tiny"
@@ -224,32 +223,28 @@ def learn_background(
         started with another background.
       KeyboardInterrupt: if its training was stopped; it has been saved.
     """
-    given = {"background": space, "radius": radius, "centre": centre, "seed": seed}
-    wanted = _resolved(scene, folder / BACKGROUND, steps, **given)
+    bounds = {"space": space, "radius": radius, "centre": centre}
+    wanted = _resolved(scene, folder, steps=steps, seed=seed, **bounds)
     return _learned(scene, folder / BACKGROUND, wanted)
 
 
-def learn_backdrop(
-    scene: Path,
-    folder: Path,
-    *,
-    seed: int,
-    space: Space | None = None,
-    radius: float | None = None,
-    centre: Position | None = None,
-) -> Backdrop | None:
+def learn_backdrop(scene: Path, folder: Path, **given: Any) -> Backdrop | None:
     """Returns the backdrop, which is solved for first if necessary; `None` if it must be a field.
 
     Arguments and errors are those of `learn_background`, but no field is trained.
     """
-    given = {"background": space, "radius": radius, "centre": centre, "seed": seed}
-    wanted = _resolved(scene, folder / BACKGROUND, STEPS, **given)
+    wanted = _resolved(scene, folder, **given)
     if wanted.model.config.backdrop is None:
         return None
     return backdrop_of(folder, _learned(scene, folder / BACKGROUND, wanted))
 
 
-def has_backdrop(
+def has_backdrop(scene: Path, folder: Path, **given: Any) -> bool:
+    """Returns whether `learn_backdrop`, which has the same arguments, returns one."""
+    return _resolved(scene, folder, **given).model.config.backdrop is not None
+
+
+def _resolved(
     scene: Path,
     folder: Path,
     *,
@@ -257,19 +252,14 @@ def has_backdrop(
     space: Space | None = None,
     radius: float | None = None,
     centre: Position | None = None,
-) -> bool:
-    """Returns whether `learn_backdrop`, which has the same arguments, returns one."""
-    given = {"background": space, "radius": radius, "centre": centre, "seed": seed}
-    wanted = _resolved(scene, folder / BACKGROUND, STEPS, **given)
-    return wanted.model.config.backdrop is not None
-
-
-def _resolved(scene: Path, run: Path, steps: int, **given: Any) -> Resolved:
-    """Returns how the background is to be learned, with the options that are given."""
+    steps: int = STEPS,
+) -> Resolved:
+    """Returns how the background is to be learned; see `learn_background`."""
     config = TrainConfig().override(
-        scene=str(scene.resolve()), pixels="background", paths="straight", **given
+        **{"scene": str(scene.resolve()), "pixels": "background", "paths": "straight"},
+        **{"background": space, "radius": radius, "centre": centre, "seed": seed},
     )
-    facts = read_facts(config.scene, parts=())
+    facts, run = read_facts(config.scene, parts=()), folder / BACKGROUND
     wanted = resolve(config, facts)
     begun = checkpoint_io.read_static(run).config if run_folder.exists(run) else wanted.model.config
     if wanted.model.config.backdrop is not None and begun.backdrop is not None:

@@ -33,6 +33,7 @@ import scipy.linalg
 import scipy.sparse
 from jaxtyping import Float, Int, Num
 
+from refref_jax.choices import SATURATED
 from refref_jax.geometry.bvh import NO_PRIMITIVE
 from refref_jax.optics.media import Interfaces
 from refref_jax.reconstruct import ReconstructionError, photometry
@@ -51,9 +52,6 @@ _LEAST_SCALE, _SCALE, _LEAST_NOISE = 0.02, 1.5, 0.005
 
 # Factor of the least scale from step to step.
 _NARROWING = 0.9
-
-# sRGB of saturated pixels, which may be brighter than they look.
-_SATURATED = 254.5 / 255.0
 
 # Linear RGB below which the slope of sRGB is held: dark noise would weigh most.
 _DARK = 2e-3
@@ -484,7 +482,7 @@ def _robust_weights(
 def _unsaturated(
     linear: Float[np.ndarray, "rays 3"], rgb: Float[np.ndarray, "rays 3"]
 ) -> np.ndarray:
-    return (rgb < _SATURATED) | (linear < 1.0)
+    return (rgb < SATURATED) | (linear < 1.0)
 
 
 def _without_largest(

@@ -32,7 +32,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from refref_jax import numerics
-from refref_jax.choices import Space
+from refref_jax.choices import SATURATED, Space
 from refref_jax.compilation import jit_quickly
 from refref_jax.render import backdrop, images, learned_media, pixels
 from refref_jax.render.backdrop import Mips, Pyramid
@@ -46,7 +46,6 @@ from refref_jax.training.backdrop_equations import (
     exposed,
     sum_of,
 )
-from refref_jax.training.objective import SATURATED
 
 # One error in this many determines their typical size.
 _EVERY = 17

@@ -29,6 +29,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, UInt8
 
 from refref_jax import choices, metrics, numerics
+from refref_jax.choices import SATURATED
 from refref_jax.compilation import jit_quickly
 from refref_jax.data import scene_folder
 from refref_jax.geometry import cameras
@@ -36,7 +37,6 @@ from refref_jax.geometry.cameras import Cameras
 from refref_jax.render import images, learned_media, pixels
 from refref_jax.render.images import Rendering
 from refref_jax.render.model import Model
-from refref_jax.training.objective import SATURATED
 
 Measured = dict[str, float | None]
 """Metrics by name; `None` if a metric is undefined or not available."""

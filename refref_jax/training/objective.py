@@ -22,6 +22,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax import numerics
+from refref_jax.choices import SATURATED
 from refref_jax.fields import hash_grid
 from refref_jax.fields.base import SurfaceSums
 from refref_jax.optics import light_paths
@@ -32,9 +33,6 @@ from refref_jax.render.model import Params
 from refref_jax.render.volume_rendering import Histogram
 from refref_jax.sampling import stepfun
 from refref_jax.training.config import LossConfig, require
-
-SATURATED = 254.5 / 255.0
-"""Colour, sRGB, from which on an 8-bit pixel is saturated."""
 
 _CHARBONNIER_PADDING = 0.001
 
