@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from experiments.dataset.handheld import wobble
 from refref_jax.reconstruct import model_selection
-from refref_jax.reconstruct.families import Sphere
+from refref_jax.reconstruct.families import Sphere, fit_sphere
 from refref_jax.reconstruct.grids import find_isosurface
 from refref_jax.reconstruct.masks import Views, carve, views_at
 from refref_jax.reconstruct.mesh_distance import silhouette_overlap
@@ -38,9 +38,9 @@ def _lump(points):
     return np.minimum.reduce([_ball(points), *each])
 
 
-def _views_from_above(body, *, pixels):
+def _views_from_above(body, *, pixels, size=160):
     """Masks with wrong edges from cameras that are all above the object, as if on a table."""
-    cameras = bodies.cameras_around(120, size=160, distance=3.2)
+    cameras = bodies.cameras_around(120, size=size, distance=3.2)
     low = (cameras.poses[:, 2, 3] > 0.9) & (cameras.poses[:, 2, 3] < 2.0)
     cameras = cameras._replace(poses=cameras.poses[low])
     exact = bodies.masks_of(body, cameras)
@@ -48,10 +48,23 @@ def _views_from_above(body, *, pixels):
     return Views(np.stack(masks), cameras)
 
 
-def _carved(views):
-    return find_isosurface(carve(*views, resolution=48))
+def _carved(views, *, resolution=48):
+    return find_isosurface(carve(*views, resolution=resolution))
 
 
+def test_a_small_ball_on_a_table_is_a_sphere(monkeypatch):
+    """With the families of fewest unknowns only, which take little time."""
+    near = lambda mesh, *, furthest: [fit_sphere(mesh, furthest=furthest), FixedShape(mesh)]
+    monkeypatch.setattr(model_selection.families, "candidates", near)
+    monkeypatch.setattr(model_selection, "_TOLERANCES", (4.0,))
+    views = _views_from_above(_ball, pixels=0.7, size=64)
+    found = model_selection.shape_from_outlines(_carved(views, resolution=24), views)
+    assert found is not None and found.name == "sphere"
+    away = np.linalg.norm(found.mesh.vertices - _CENTRE, axis=-1)
+    assert away == pytest.approx(_RADIUS, rel=0.02)
+
+
+@pytest.mark.slow
 def test_a_ball_on_a_table_is_found_in_masks_whose_edges_are_wrong():
     views, exact = (_views_from_above(_ball, pixels=pixels) for pixels in (2.0, 0.0))
     carved = _carved(views)
