@@ -7,8 +7,8 @@ Compiles what training runs (light paths of a pool of batches, steps, the produc
 backdrops) for an H100 and for this CPU, each in a process of its own, and prints kernels, bytes and
 temporaries by part. Counts are those of `ahead_of_time.counters`; nothing runs. A step is one
 iteration of its program. Asserted is that no kernel compares and swaps, and that kernels, bytes,
-temporaries and launches are at most 2 % above `results/compiled_programs.json`, which `--write`
-writes.
+temporaries, launches and the longest kernel's text are at most 2 % above
+`results/compiled_programs.json`, which `--write` writes.
 """
 
 import json
@@ -37,12 +37,12 @@ def main(arguments: list[str]) -> None:
             counted = counts_of(name, target, packages=_PACKAGES.value)
             print("\n".join(_rows(name, target, counted)), flush=True)
             before = recorded.setdefault(name, {}).get(target, counted)
-            if target == "h100":
+            if target == "h100" and not _WRITE.value:
                 wrong += [f"{name}: {each}" for each in excess(counted, before)]
             recorded[name][target] = counted
             if _WRITE.value:
                 RECORDED.write_text(json.dumps(recorded, indent=1) + "\n")
-    assert _WRITE.value or not wrong, "; ".join(wrong)
+    assert not wrong, "; ".join(wrong)
 
 
 def _rows(program: str, target: str, counted: dict[str, Any]) -> list[str]:

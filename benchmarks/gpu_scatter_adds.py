@@ -19,7 +19,7 @@ from pathlib import Path
 from absl import app, flags
 
 from benchmarks.ahead_of_time import hopper
-from refref_jax.compilation import ATOMICS_FLAG, SLOW_ATOMICS
+from refref_jax.compilation import ATOMICS_FLAG
 
 _PACKAGES = flags.DEFINE_list("packages", [], "Folders of packages with the plugin for CUDA 13.")
 _CUDA = flags.DEFINE_string("cuda", "", "Folder of CUDA; by default that of ptxas.")
@@ -46,11 +46,11 @@ def main(arguments: list[str]) -> None:
     for folder in _PACKAGES.value:
         version, found = _compiled(folder, "")
         print(f"| {version} | none | {found} |", flush=True)
-        if ("cas" in found) != (version in SLOW_ATOMICS):
+        if ("cas" in found) != (version in ATOMICS_FLAG.versions):
             wrong.append(f"{version} without the flag: {found}")
-        if version in SLOW_ATOMICS:
-            _, found = _compiled(folder, ATOMICS_FLAG)
-            print(f"| {version} | `{ATOMICS_FLAG}` | {found} |", flush=True)
+        if version in ATOMICS_FLAG.versions:
+            _, found = _compiled(folder, ATOMICS_FLAG.text)
+            print(f"| {version} | `{ATOMICS_FLAG.text}` | {found} |", flush=True)
             wrong += [f"{version} with the flag: {found}"] if "cas" in found else []
     assert not wrong, "; ".join(wrong)
 

@@ -6,7 +6,8 @@ Writes report.md and report.json: the environment and versions that are known to
 random reads and additions in memory; closest hits, light paths and the gradient of a training step
 against the CPU's; two trainings of some steps from the same state; time, compilation and memory of
 tracing, training steps and rendering for each preset, and of the backdrop's solver. Each line has a
-verdict. Something that fails, for example because memory runs out, becomes a line, too.
+verdict, and is printed as soon as its part is done. Something that fails, for example because
+memory runs out, becomes a line, too.
 
 It takes a few minutes, trains on the bundled scene, and keeps no model. Without an accelerator it
 compares the CPU with itself, and says so.
@@ -35,6 +36,9 @@ _PRESETS = flags.DEFINE_list(
     f"Presets whose programs are timed: {', '.join(cli_flags.PRESETS)}; by default "
     f"{','.join(_OF_AN_ACCELERATOR)} on an accelerator, {','.join(_OF_A_CPU)} on a CPU.",
 )
+_PARTS = flags.DEFINE_list(
+    "parts", [], "Parts to run, by the beginnings of their headings in the report; by default all."
+)
 _STEPS = flags.DEFINE_integer("steps", 200, "Training steps of the repeated runs.", 2)
 _OVERWRITE = cli_flags.overwrite("an earlier report")
 
@@ -61,13 +65,15 @@ def main() -> None:
     context = measuring.find_context(Path(__file__).parents[1] / _SCENE, _STEPS.value)
     usual = _OF_AN_ACCELERATOR if context.compares else _OF_A_CPU
     print(f"{report.describe(context)}.", flush=True)
-    parts = report.parts_of(tuple(dict.fromkeys(_PRESETS.value or usual)))
+    everything = report.parts_of(tuple(dict.fromkeys(_PRESETS.value or usual)))
+    parts = report.chosen(everything, _PARTS.value)
     results = []
     with outputs.fresh(out, **place) as draft:
         with ProgressBar("check", len(parts)) as bar:
             for part in parts:
                 results.append(report.run_part(part, context))
                 bar.show(len(results), part.name)
+                print(report.in_words(results[-1]), flush=True)
         report.write(draft, context, results)
     for line in report.with_verdict(results, "problem", "failed"):
         print(line)

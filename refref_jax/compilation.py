@@ -8,9 +8,9 @@ ignore it, and only the speed changes.
 `chosen_by_platform` makes one function of two, for CPUs and for other devices. `at_once` runs
 programs in several threads of the host.
 
-Some versions compile scatter-adds of single floats for NVIDIA GPUs as loops that compare and swap,
-hundreds of times slower than an addition in memory. `add_missing_flag` sets the flag that they
-need, before JAX starts.
+NVIDIA GPUs need flags of XLA with some versions (`NEEDED_FLAGS`): scatter-adds of single floats are
+compiled as loops that compare and swap, hundreds of times slower than an addition in memory, and
+steps of large presets compile for minutes. `add_missing_flags` sets them, before JAX starts.
 
 The environment variable `REFREF_TRAVERSAL` chooses how closest hits are found. Programs that are
 compiled already keep what they were compiled with.
@@ -23,7 +23,7 @@ import os
 import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Literal, ParamSpec, TypeVar
+from typing import Any, Literal, NamedTuple, ParamSpec, TypeVar
 
 import jax
 import numpy as np
@@ -33,13 +33,46 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 from jaxtyping import Array
 
-SLOW_ATOMICS = ("0.10.2", "0.11.0")
-"""Versions of jaxlib whose scatter-adds compare and swap (jax-ml/jax#38806)."""
 
-ATOMICS_FLAG = "--xla_backend_extra_options=-nvptx-allow-ftz-atomics"
+class XlaFlag(NamedTuple):
+    """A flag of XLA that NVIDIA GPUs need.
 
-# Parts of flags with which these versions add in memory, as their PTX shows.
-_ENOUGH = ("nvptx-allow-ftz-atomics", "--xla_gpu_ftz=true")
+    Attributes:
+      text: flag and value.
+      versions: versions of jaxlib that need it; others may refuse it.
+      enough: parts of flags with the same effect, or by which users choose for themselves.
+      otherwise: what happens without it.
+      source: where this is known from.
+    """
+
+    text: str
+    versions: tuple[str, ...]
+    enough: tuple[str, ...]
+    otherwise: str
+    source: str
+
+
+ATOMICS_FLAG = XlaFlag(
+    "--xla_backend_extra_options=-nvptx-allow-ftz-atomics",
+    versions=("0.10.2", "0.11.0"),
+    enough=("nvptx-allow-ftz-atomics", "--xla_gpu_ftz=true"),
+    otherwise="scatter-adds compare and swap",
+    source="jax-ml/jax#38806",
+)
+"""Makes `atom.add.f32` of `atom.cas.b32` in the PTX of jaxlib 0.10.2 for an H100
+(`benchmarks.gpu_scatter_adds`)."""
+
+AUTOTUNER_FLAG = XlaFlag(
+    "--xla_gpu_experimental_enable_fusion_autotuner=false",
+    versions=("0.10.0", "0.10.1", "0.10.2", "0.11.0", "0.11.1", "0.11.2"),
+    enough=("--xla_gpu_experimental_enable_fusion_autotuner",),
+    otherwise="large training steps compile for minutes",
+    source="tue-bmd/zea#599",
+)
+"""Reductions are then not compiled in several ways to choose from."""
+
+NEEDED_FLAGS = (ATOMICS_FLAG, AUTOTUNER_FLAG)
+"""All of these flags."""
 
 _PLUGINS = ("jax-cuda12-plugin", "jax-cuda13-plugin")
 
@@ -109,14 +142,16 @@ def with_record(values: Array, at: Array, value: Array) -> Array:
     return update(values, value, at, axis=0, allow_negative_indices=False)
 
 
-def is_flag_missing() -> bool:
-    """Returns whether this version of jaxlib is slow on NVIDIA GPUs without a flag not yet set.
+def missing_flags() -> tuple[XlaFlag, ...]:
+    """Returns the flags that this version of jaxlib needs and that are not set.
 
     Without a CUDA plugin, no flag is missing.
     """
-    flags = os.environ.get("XLA_FLAGS", "")
-    slow = _version("jaxlib") in SLOW_ATOMICS and any(_version(each) for each in _PLUGINS)
-    return slow and not any(each in flags for each in _ENOUGH)
+    if not any(_version(each) for each in _PLUGINS):
+        return ()
+    flags, version = os.environ.get("XLA_FLAGS", ""), _version("jaxlib")
+    needed = (each for each in NEEDED_FLAGS if version in each.versions)
+    return tuple(each for each in needed if not any(part in flags for part in each.enough))
 
 
 def chosen_by_platform(
@@ -243,26 +278,22 @@ def fetch(tree: _Tree, *, instead: str) -> _Tree:
     return jax.tree.map(np.asarray, jax.device_get(tree))
 
 
-def add_missing_flag() -> None:
-    """Sets the flag of XLA that a slow version needs on NVIDIA GPUs; other versions refuse it.
+def add_missing_flags() -> None:
+    """Sets the flags of XLA that this version needs on NVIDIA GPUs (`NEEDED_FLAGS`).
 
     Does nothing without a CUDA plugin. JAX reads flags when it starts, that is, with the first
     array: later, or if the flag's name has another value already, a warning says what to do.
-
-    Source: openxla/xla#46225. With the flag, `atom.cas.b32` becomes `atom.add.f32` in the PTX of
-    jaxlib 0.10.2 for an H100 (`benchmarks.gpu_scatter_adds`).
     """
-    if not is_flag_missing():
-        return
-    flags, name = os.environ.get("XLA_FLAGS", ""), ATOMICS_FLAG.split("=")[0]
-    if has_started() or name in flags:
-        warnings.warn(
-            f"jaxlib {_version('jaxlib')} is slow on NVIDIA GPUs: its scatter-adds compare and "
-            f"swap. Set XLA_FLAGS={ATOMICS_FLAG} before JAX starts, or install jax==0.10.1.",
-            stacklevel=3,
-        )
-        return
-    os.environ["XLA_FLAGS"] = f"{flags} {ATOMICS_FLAG}".strip()
+    for flag in missing_flags():
+        flags, name = os.environ.get("XLA_FLAGS", ""), flag.text.split("=")[0]
+        if has_started() or name in flags:
+            warnings.warn(
+                f"jaxlib {_version('jaxlib')} is slow on NVIDIA GPUs: {flag.otherwise}. Set "
+                f"XLA_FLAGS={flag.text} before JAX starts ({flag.source}).",
+                stacklevel=3,
+            )
+            continue
+        os.environ["XLA_FLAGS"] = f"{flags} {flag.text}".strip()
 
 
 def chosen_traversal() -> Literal["xla", "warp"]:

@@ -1,4 +1,4 @@
-"""The flag for slow versions of XLA, functions chosen by platform, and the choice of traversal.
+"""Flags for slow versions of XLA, functions chosen by platform, and the choice of traversal.
 
 Loops are tested where they are used.
 """
@@ -20,6 +20,7 @@ import pytest
 from refref_jax import compilation
 
 _FLAG = "--xla_backend_extra_options=-nvptx-allow-ftz-atomics"
+_NO_AUTOTUNER = "--xla_gpu_experimental_enable_fusion_autotuner=false"
 
 
 @pytest.fixture
@@ -39,22 +40,35 @@ def installed(monkeypatch):
 
 
 def test_a_slow_version_with_a_cuda_plugin_gets_the_flag(installed):
-    compilation.add_missing_flag()
-    assert os.environ["XLA_FLAGS"] == f"--xla_dump_to=here {_FLAG}"
-    compilation.add_missing_flag()
-    assert os.environ["XLA_FLAGS"].count("nvptx") == 1
+    compilation.add_missing_flags()
+    assert os.environ["XLA_FLAGS"] == f"--xla_dump_to=here {_FLAG} {_NO_AUTOTUNER}"
+    compilation.add_missing_flags()
+    assert os.environ["XLA_FLAGS"].count("nvptx") == os.environ["XLA_FLAGS"].count("tuner") == 1
 
 
 @pytest.mark.parametrize("version", ["0.10.0", "0.10.1", "0.11.2"])
 def test_other_versions_which_refuse_the_flag_do_not_get_it(installed, version):
     installed["jaxlib"] = version
-    compilation.add_missing_flag()
+    compilation.add_missing_flags()
+    assert os.environ["XLA_FLAGS"] == f"--xla_dump_to=here {_NO_AUTOTUNER}"
+
+
+def test_versions_that_are_not_known_get_no_flag(installed):
+    installed["jaxlib"] = "0.12.0"
+    compilation.add_missing_flags()
     assert os.environ["XLA_FLAGS"] == "--xla_dump_to=here"
+
+
+def test_the_autotuner_stays_as_a_user_has_set_it(installed, monkeypatch):
+    chosen = f"{_FLAG} --xla_gpu_experimental_enable_fusion_autotuner=true"
+    monkeypatch.setenv("XLA_FLAGS", chosen)
+    compilation.add_missing_flags()
+    assert os.environ["XLA_FLAGS"] == chosen
 
 
 def test_nothing_is_set_without_a_cuda_plugin(installed):
     del installed["jax-cuda13-plugin"]
-    compilation.add_missing_flag()
+    compilation.add_missing_flags()
     assert os.environ["XLA_FLAGS"] == "--xla_dump_to=here"
 
 
@@ -65,22 +79,22 @@ def test_flags_with_the_same_effect_are_left_alone(installed, monkeypatch, flags
     monkeypatch.setenv("XLA_FLAGS", flags)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        compilation.add_missing_flag()
-    assert os.environ["XLA_FLAGS"] == flags
+        compilation.add_missing_flags()
+    assert os.environ["XLA_FLAGS"] == f"{flags} {_NO_AUTOTUNER}"
 
 
 def test_a_warning_says_what_to_do_where_it_is_too_late(installed, monkeypatch):
     monkeypatch.setattr(compilation, "has_started", lambda: True)
     with pytest.warns(UserWarning, match=r"jaxlib 0\.10\.2 is slow on NVIDIA.*before JAX starts"):
-        compilation.add_missing_flag()
+        compilation.add_missing_flags()
     assert os.environ["XLA_FLAGS"] == "--xla_dump_to=here"
 
 
 def test_other_options_of_the_same_flag_are_not_overwritten(installed, monkeypatch):
-    flags = "--xla_backend_extra_options=-x"
+    flags = f"--xla_backend_extra_options=-x {_NO_AUTOTUNER}"
     monkeypatch.setenv("XLA_FLAGS", flags)
     with pytest.warns(UserWarning, match="Set XLA_FLAGS=.*nvptx"):
-        compilation.add_missing_flag()
+        compilation.add_missing_flags()
     assert os.environ["XLA_FLAGS"] == flags
 
 

@@ -35,7 +35,8 @@ TARGETS = ("h100", "cpu")
 RECORDED = Path(__file__).parents[1] / "results" / "compiled_programs.json"
 """Counts by program and target."""
 
-BOUNDED = ("kernels", "bytes", "temporaries")
+# The longest text of a kernel: one that keeps too much in registers compiles for a minute.
+BOUNDED = ("kernels", "bytes", "temporaries", "longest")
 
 # Counts may grow by this much before they are refused.
 _ALLOWED = 1.02
@@ -87,7 +88,7 @@ def excess(counted: dict[str, Any], recorded: dict[str, Any]) -> list[str]:
 
 
 def main(program: str, target: str, dump: str) -> None:
-    compilation.add_missing_flag()
+    compilation.add_missing_flags()
     make, part = PROGRAMS[program]
     place = hopper.placed if target == "h100" else lambda tree: tree
     compiled = make().trace(place).lower().compile()
@@ -96,7 +97,7 @@ def main(program: str, target: str, dump: str) -> None:
 
 def _counts(compiled: Any, part: Callable[[Kernel], str], dump: Path) -> dict[str, Any]:
     found = counters.kernels(counters.parse(compiled.as_text()))
-    ptx = "".join(path.read_text() for path in dump.glob("*.ptx"))
+    texts = [path.read_text() for path in dump.glob("*.ptx")]
     # JAX has no cost analysis of programs for GPUs.
     cost = compiled.cost_analysis() or {}
     return {
@@ -108,7 +109,8 @@ def _counts(compiled: Any, part: Callable[[Kernel], str], dump: Path) -> dict[st
         "launches": [counters.launches(found, depth) for depth in range(4)],
         "largest_pad": _largest_pad(found),
         "parts": {name: list(count) for name, count in counters.by_part(found, part).items()},
-        "atomics": sorted(set(re.findall(r"\batom\.[\w.:]*", ptx))),
+        "longest": max(map(len, texts), default=0),
+        "atomics": sorted(set(re.findall(r"\batom\.[\w.:]*", "".join(texts)))),
     }
 
 

@@ -25,6 +25,9 @@ NOT_REPORTED = "not reported"
 # Largest number of timed calls, and the seconds after which no other one begins.
 _MOST_CALLS, _PATIENCE = 5, 2.0
 
+# Copies in a call, so that the launch does not count.
+_COPIES = 8
+
 _Result = Any
 
 
@@ -236,8 +239,9 @@ def best_of(function: Callable[[], _Result]) -> float:
 def copy_speed(device: jax.Device, floats: int) -> float:
     """Returns the bytes per second that a copy reads and writes."""
     values = jax.device_put(np.ones(floats, np.float32), device)
-    copy = jax.jit(lambda x: x + jnp.float32(1.0))
-    return 2 * values.nbytes / best_of(lambda: copy(values))
+    repeat = functools.partial(jax.lax.fori_loop, 0, _COPIES, lambda _, x: x + jnp.float32(1.0))
+    copy = jax.jit(repeat)
+    return _COPIES * 2 * values.nbytes / best_of(lambda: copy(values))
 
 
 def gigabytes(count: float | None) -> float | str:

@@ -20,10 +20,10 @@ _HEADER = "| quantity | value | unit | verdict | limit or remark |\n|---|---|---
 
 _LEGEND = """\
 Verdicts: `ok` and `problem` compare a value with its limit; `failed` is an error, and the other
-parts were run all the same; `-` is a value for which nothing is expected. Limits were chosen before
-the code had run on an accelerator. Times are those of the fastest of several calls; compiling is
-timed apart. Bytes are those that the compiler counts for the program of this device: training steps
-count as one; on a CPU, the loops over hash tables are left out.
+parts were run all the same; `-` is a value for which nothing is expected. Times are those of the
+fastest of several calls; compiling is timed apart. Bytes are those that the compiler counts for
+the program of this device: training steps count as one; on a CPU, the loops over
+hash tables are left out.
 """
 
 
@@ -81,6 +81,20 @@ def parts_of(presets: Sequence[str]) -> tuple[Part, ...]:
     return (*_ONCE, *by_preset, *_LAST)
 
 
+def chosen(parts: Sequence[Part], headings: Sequence[str]) -> tuple[Part, ...]:
+    """Returns the parts whose names begin with one of some headings; all parts if there are none.
+
+    Raises:
+      ValueError: if a heading begins no name.
+    """
+    for heading in headings:
+        if not any(part.name.lower().startswith(heading.lower()) for part in parts):
+            names = ", ".join(part.name for part in parts)
+            raise ValueError(f"--parts: no part begins with {heading!r}. There are: {names}.")
+    begins = tuple(heading.lower() for heading in headings)
+    return tuple(part for part in parts if not begins or part.name.lower().startswith(begins))
+
+
 def run_part(part: Part, context: Context) -> Result:
     """Runs a part; an error becomes its last line."""
     begun, rows = time.perf_counter(), []
@@ -98,6 +112,15 @@ def describe(context: Context) -> str:
         name = f"{context.device.device_kind} ({context.device.platform})"
         return f"{name}, compared with the CPU of the same machine"
     return "no accelerator found: compared the CPU with itself"
+
+
+def in_words(result: Result) -> str:
+    """Returns the lines of a part as text, with verdicts where there are any, and its duration."""
+    lines = [
+        f"  {row.name}: {_value(row)}" + f"  {row.verdict}" * (row.verdict != "-")
+        for row in result.rows
+    ]
+    return "\n".join([*lines, f"  in {result.seconds:.0f} s"])
 
 
 def with_verdict(results: Sequence[Result], *verdicts: str) -> list[str]:

@@ -72,7 +72,7 @@ def run(main: Callable[..., None], *, arguments: Sequence[str] = (), again: str 
         refuse_words(module, words[1:], arguments)
         program_cache.keep()
         if importlib.util.find_spec("jax_plugins"):  # JAX may run on a GPU
-            importlib.import_module("refref_jax.compilation").add_missing_flag()
+            importlib.import_module("refref_jax.compilation").add_missing_flags()
         try:
             if "allow_outside" in flags.FLAGS and flags.FLAGS["allow_outside"].value:
                 os.environ[ALLOW_OUTSIDE] = "1"  # other processes that this one starts inherit it

@@ -7,10 +7,15 @@ cumulative function at the edges, from 0 to 1. All functions take leading batch 
 Source: Barron et al., Mip-NeRF 360 (2022), section 3 and Zip-NeRF (2023), section 3.
 """
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from refref_jax import numerics
+
+
+# Values that a search on a GPU compares at once.
+_BLOCK = 16
 
 
 def weight_to_pdf(
@@ -147,9 +152,27 @@ def count_below(
     """Returns the number of values <= each query: a right-sided search by brute force.
 
     For the few dozen bins of a path this is faster than a binary search, whose steps are
-    sequential.
+    sequential. Off CPUs it has two steps, among the ends of blocks and in a block: else XLA keeps
+    all that it compares in registers, many more than a GPU has, and compiles that for a minute.
     """
-    return jnp.sum(sorted_values[..., None, :] <= queries[..., :, None], axis=-1, dtype=jnp.int32)
+    return jax.lax.platform_dependent(
+        sorted_values, queries, cpu=_count_at_once, default=_count_in_blocks
+    )
+
+
+def _count_at_once(values: Array, queries: Array) -> Int[Array, "*batch m"]:
+    return jnp.sum(values[..., None, :] <= queries[..., :, None], axis=-1, dtype=jnp.int32)
+
+
+def _count_in_blocks(values: Array, queries: Array) -> Int[Array, "*batch m"]:
+    count = values.shape[-1]
+    ends = values[..., _BLOCK - 1 :: _BLOCK]
+    first = _BLOCK * _count_at_once(ends, queries)
+    offsets = jax.lax.broadcasted_iota(jnp.int32, (*first.shape, _BLOCK), first.ndim)
+    index = first[..., None] + offsets
+    found = jnp.take_along_axis(values[..., None, :], jnp.minimum(index, count - 1), axis=-1)
+    below = (index < count) & (found <= queries[..., None])
+    return first + jnp.sum(below, axis=-1, dtype=jnp.int32)
 
 
 def take(values: Array, index: Int[Array, "*batch m"]) -> Array:

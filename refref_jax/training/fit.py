@@ -104,7 +104,7 @@ def fit(
       ValueError: if the configuration, the scene or the folder is not suitable for training.
       KeyboardInterrupt: if `stop` returned `True` before the first step.
     """
-    compilation.add_missing_flag()
+    compilation.add_missing_flags()
     with contextlib.ExitStack() as stack:
         if out is None:
             out = stack.enter_context(tempfile.TemporaryDirectory(prefix="refref_jax_"))

@@ -96,6 +96,21 @@ def test_parts_that_train_nothing_are_reported_and_agree(tmp_path, monkeypatch):
     assert len(speeds) == 7 and min(speeds) > 0.0
 
 
+def test_parts_are_chosen_by_the_beginnings_of_their_headings():
+    parts = report.parts_of(["tiny", "paper"])
+    chosen = report.chosen(parts, ["memory", "Preset paper: t"])
+    assert [part.name.partition(":")[0] for part in chosen] == ["Memory", *2 * ["Preset paper"]]
+    assert report.chosen(parts, []) == parts
+    with pytest.raises(ValueError, match=r"no part begins with 'memry'\. There are: Environment"):
+        report.chosen(parts, ["memry"])
+
+
+def test_a_finished_part_is_told_with_verdicts_and_seconds():
+    rows = (Row("rate", 2.5, "GB/s"), Row("rays", 1024, "", "ok"), Row("error", "none", "", "-"))
+    told = report.in_words(report.Result("Memory", 2.4, rows))
+    assert told == "  rate: 2.5 GB/s\n  rays: 1,024  ok\n  error: none\n  in 2 s"
+
+
 def test_a_gradient_with_one_wrong_array_is_found():
     right = {"grid": np.full(300, 0.1), "network": {"bias": np.ones(1), "kernel": np.zeros(9)}}
     wrong = {"grid": np.full(300, 0.1), "network": {"bias": np.full(1, 1.2), "kernel": np.zeros(9)}}

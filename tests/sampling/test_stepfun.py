@@ -248,6 +248,25 @@ def test_count_below_is_a_right_sided_search():
     assert stepfun.count_below(values, queries).dtype == jnp.int32
 
 
+@pytest.mark.parametrize("count", [0, 1, 2, 7, 8, 65])
+def test_accelerators_count_the_same_values_in_blocks(count):
+    draw = np.random.default_rng(count)
+    values = np.sort(np.round(draw.uniform(size=(3, count)), 1), axis=-1).astype(np.float32)
+    queries = np.round(draw.uniform(-0.2, 1.2, (3, 40)), 1).astype(np.float32)
+    expected = np.stack(
+        [np.searchsorted(*each, side="right") for each in zip(values, queries, strict=True)]
+    )
+    got = stepfun._count_in_blocks(jnp.asarray(values), jnp.asarray(queries))
+    np.testing.assert_array_equal(got, expected)
+
+
+def test_only_cpus_compare_all_values():
+    traced = jax.jit(stepfun.count_below).trace(jnp.ones((5, 65)), jnp.ones((5, 9)))
+    for platform, compares in {"cpu": True, "cuda": False, "tpu": False}.items():
+        text = traced.lower(lowering_platforms=(platform,)).as_text()
+        assert ("5x9x65" in text) == compares
+
+
 def test_take_works_batch_by_batch():
     values = jnp.arange(12.0).reshape(2, 2, 3)
     index = jnp.array([[[0, 2], [1, 1]], [[2, 2], [0, 1]]])
