@@ -44,22 +44,38 @@ def check_precision(precision: str) -> None:
         )
 
 
-def dense(precision: Precision) -> Callable[..., nn.Dense]:
-    """Returns flax's dense layer, `x @ kernel + bias`, with factors in a given precision."""
-    return functools.partial(nn.Dense, dot_general=dot_general(precision))
+def dense(precision: Precision, *, hidden: bool = False) -> Callable[..., nn.Dense]:
+    """Returns flax's dense layer, `x @ kernel + bias`, with factors in a given precision.
+
+    Args:
+      precision: precision of the factors.
+      hidden: whether the result, which the next layer rounds anyway, is in that precision, too. It
+        is kept for the backward pass, where it is most of what a step reads and writes.
+    """
+    if precision == "float32":
+        return nn.Dense
+    if hidden:
+        return functools.partial(nn.Dense, dtype=jnp.bfloat16)
+    return functools.partial(nn.Dense, dtype=jnp.float32, dot_general=_product)
 
 
-def dot_general(precision: Precision) -> Callable[..., Array]:
-    """Returns `jax.lax.dot_general`, or one that rounds its factors to bfloat16."""
-    return jax.lax.dot_general if precision == "float32" else _product
+def dot_general(precision: Precision, *, hidden: bool = False) -> Callable[..., Array]:
+    """Returns `jax.lax.dot_general`, or one that rounds its factors; arguments as in `dense`."""
+    if precision == "float32":
+        return jax.lax.dot_general
+    return _rounded_product if hidden else _product
 
 
 def _product(left: Array, right: Array, axes: Any, precision: None = None) -> Array:
-    """Returns the matrix product of factors rounded to bfloat16, summed in their original type."""
+    """Returns the matrix product of factors rounded to bfloat16, in single precision."""
+    return _rounded_product(left, right, axes, precision, preferred_element_type=jnp.float32)
+
+
+def _rounded_product(
+    left: Array, right: Array, axes: Any, precision: None = None, **options: Any
+) -> Array:
     factors = left.astype(jnp.bfloat16), right.astype(jnp.bfloat16)
-    return jax.lax.dot_general(
-        *factors, axes, precision=precision, preferred_element_type=left.dtype
-    )
+    return jax.lax.dot_general(*factors, axes, precision=precision, **options)
 
 
 @dataclasses.dataclass(frozen=True)

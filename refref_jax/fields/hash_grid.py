@@ -271,7 +271,7 @@ def grid_network(
     layer = dense(precision)
     features = MultisampledGrid(grid, precision)(gaussians)
     # Flax numbers layers in order of creation, and checkpoints contain these names.
-    hidden = nn.relu(layer(width)(features))
+    hidden = nn.relu(dense(precision, hidden=True)(width)(features))
     return layer(outputs)(hidden)
 
 
@@ -290,27 +290,27 @@ def density_and_colour(
       direction: unit direction of travel.
       config: shape of the field.
     """
-    layer = dense(config.precision)
+    layer, between = dense(config.precision), dense(config.precision, hidden=True)
     features = MultisampledGrid(config.grid, config.precision)(gaussians)
-    hidden = nn.relu(layer(config.density_width)(features))
+    hidden = nn.relu(between(config.density_width)(features))
     if config.colour_network == "skip" or not config.colour_depth:
         raw = layer(1 + config.bottleneck)(hidden)
         return raw[0], colour(raw[1:], direction, config)
-    encoded = spherical_harmonics(direction)
+    encoded = spherical_harmonics(direction).astype(hidden.dtype)
     # Names are those that flax would give to layers, as checkpoints contain them.
     widths = config.bottleneck + encoded.size, config.colour_width
-    multiply = multiplied_by(config.precision)
+    product = affine(config.precision)
     density, hidden = jax.lax.platform_dependent(
         hidden,
         encoded,
         _Weights(config.density_width, 1 + config.bottleneck, name="Dense_1")(),
         _Weights(*widths, name="Dense_2")(),
-        cpu=functools.partial(in_turn, multiply),
-        default=functools.partial(joined, multiply),
+        cpu=functools.partial(in_turn, product),
+        default=functools.partial(joined, product),
     )
     hidden = nn.relu(hidden)
     for i in range(1, config.colour_depth):
-        hidden = nn.relu(layer(config.colour_width, name=f"Dense_{2 + i}")(hidden))
+        hidden = nn.relu(between(config.colour_width, name=f"Dense_{2 + i}")(hidden))
     return density, jax.nn.sigmoid(layer(3, name=f"Dense_{2 + config.colour_depth}")(hidden))
 
 
@@ -330,17 +330,23 @@ class _Weights(nn.Module):
 _Layer = tuple[Float[Array, "_ _"], Float[Array, " _"]]
 """Kernel and bias."""
 
-_Multiply = Callable[[Array, Array], Array]
+_Affine = Callable[..., Array]
+"""Product with a kernel, plus the bias; see `affine`."""
 
 
-def multiplied_by(precision: Precision) -> _Multiply:
-    """Returns the product of a vector and a kernel, as in flax's dense layer."""
-    dot = dot_general(precision)
-    return lambda values, kernel: dot(values, kernel, (((0,), (0,)), ((), ())), precision=None)
+def affine(precision: Precision) -> _Affine:
+    """Returns the function of a vector and a layer that flax's dense layer is; see `dense`."""
+
+    def apply(values: Array, layer: _Layer, *, hidden: bool = False) -> Array:
+        dot = dot_general(precision, hidden=hidden)
+        product = dot(values, layer[0], (((0,), (0,)), ((), ())), precision=None)
+        return product + layer[1].astype(product.dtype)
+
+    return apply
 
 
 def in_turn(
-    multiply: _Multiply,
+    apply: _Affine,
     hidden: Float[Array, " width"],
     encoded: Float[Array, "16"],
     head: _Layer,
@@ -349,21 +355,21 @@ def in_turn(
     """Returns density, and outputs of the first layer of colour, both without activation.
 
     Args:
-      multiply: product of a vector and a kernel.
+      apply: product of a vector and a layer, from `affine`.
       hidden: outputs of the hidden layer of density.
       encoded: encoded direction.
       head: layer with the outputs density and bottleneck.
       first: layer of bottleneck and encoded direction.
     """
     with jax.named_scope("Dense_1"):
-        raw = multiply(hidden, head[0]) + head[1]
+        raw = apply(hidden, head)
     with jax.named_scope("Dense_2"):
-        inputs = jnp.concatenate([raw[1:], encoded])
-        return raw[0], multiply(inputs, first[0]) + first[1]
+        inputs = jnp.concatenate([raw[1:].astype(encoded.dtype), encoded])
+        return raw[0], apply(inputs, first, hidden=True)
 
 
 def joined(
-    multiply: _Multiply,
+    apply: _Affine,
     hidden: Float[Array, " width"],
     encoded: Float[Array, "16"],
     head: _Layer,
@@ -373,14 +379,14 @@ def joined(
     kernel, bias = head
     bottleneck = kernel.shape[1] - 1
     with jax.named_scope("Dense_1"):
-        density = multiply(hidden, kernel[:, :1])[0] + bias[0]
+        density = apply(hidden, (kernel[:, :1], bias[:1]))[0]
     with jax.named_scope("Dense_2"):
         of_bottleneck, of_direction = first[0][:bottleneck], first[0][bottleneck:]
         both = numerics.product(kernel[:, 1:], of_bottleneck)
         shift = numerics.product(bias[1:], of_bottleneck) + first[1]
         inputs = jnp.concatenate([hidden, encoded])
-        outputs = multiply(inputs, jnp.concatenate([both, of_direction])) + shift
-    return density, outputs
+        weights = jnp.concatenate([both, of_direction])
+        return density, apply(inputs, (weights, shift), hidden=True)
 
 
 def colour(
@@ -403,10 +409,10 @@ def directional_network(
 
     Source: Zip-NeRF's code in PyTorch, on which the paper's is based, for the skip connection.
     """
-    layer = dense(config.precision)
+    layer, between = dense(config.precision), dense(config.precision, hidden=True)
     inputs = hidden = jnp.concatenate([bottleneck, spherical_harmonics(direction)])
     for i in range(config.colour_depth):
-        hidden = nn.relu(layer(config.colour_width)(hidden))
+        hidden = nn.relu(between(config.colour_width)(hidden))
         if i == 0 and config.colour_network == "skip":
-            hidden = jnp.concatenate([hidden, inputs])
+            hidden = jnp.concatenate([hidden, inputs.astype(hidden.dtype)])
     return layer(outputs)(hidden)

@@ -13,7 +13,6 @@ from jaxtyping import Array, Float, Int
 
 from refref_jax import numerics
 
-
 # Values that a search on a GPU compares at once.
 _BLOCK = 16
 

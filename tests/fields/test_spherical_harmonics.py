@@ -60,12 +60,12 @@ def test_two_linear_layers_in_a_row_are_one(precision):
         shapes,
         is_leaf=lambda x: isinstance(x[0], int),
     )
-    multiply = hash_grid.multiplied_by(precision)
+    apply = hash_grid.affine(precision)
 
     def value_and_slopes(layers):
         def squares(*arguments):
-            density, outputs = layers(multiply, *arguments)
-            return density**2 + jnp.sum(outputs**2)
+            density, outputs = layers(apply, *arguments)
+            return density**2 + jnp.sum(outputs.astype(jnp.float32) ** 2)
 
         return jax.jit(jax.value_and_grad(squares, argnums=(0, 1, 2, 3)))(*arguments)
 
