@@ -14,13 +14,13 @@ from refref_jax.render.background_rendering import KnownImage as KnownImage
 from refref_jax.render.background_rendering import KnownRendering as KnownRendering
 from refref_jax.render.background_rendering import render_known as render_known
 from refref_jax.render.background_rendering import render_known_camera as render_known_camera
-from refref_jax.render.background_rendering import shade as shade
 from refref_jax.render.backgrounds import CubeBackground as CubeBackground
 from refref_jax.render.backgrounds import Environment as Environment
 from refref_jax.render.backgrounds import LinearTexture as LinearTexture
 from refref_jax.render.backgrounds import SphereBackground as SphereBackground
 from refref_jax.render.backgrounds import SrgbTexture as SrgbTexture
 from refref_jax.render.backgrounds import radiance_of as radiance_of
+from refref_jax.render.backgrounds import shade as shade
 from refref_jax.render.checkpoint_io import load_model as load_model
 from refref_jax.render.images import Rendering as Rendering
 from refref_jax.render.images import render_camera as render_camera

@@ -21,17 +21,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from refref_jax import numerics
 from refref_jax.choices import side_of
 from refref_jax.compilation import fetch, is_transforming, jit_quickly, refuse_tracers, threads
 from refref_jax.geometry import cameras as pinholes
 from refref_jax.geometry.cameras import Cameras
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import light_paths, path_tracing
-from refref_jax.optics.light_paths import LightPaths, PathEnds
 from refref_jax.optics.media import Scene
 from refref_jax.optics.path_settings import STRAIGHT, PathSettings
-from refref_jax.render import images, pixels
+from refref_jax.render import backgrounds, images, pixels
 from refref_jax.render.backgrounds import Radiance
 
 TILE = 65536
@@ -41,14 +39,8 @@ _INSTEAD = (
     "Call it outside, or use trace or follow_main_branches and shade, which are pure functions."
 )
 
-# Middles of the quadrants of a pixel, whose edges are root 3 times its ray differential.
-_QUADRANTS = np.sqrt(3.0) / 4.0 * np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)])
-
 # Largest number of rays for the background of a pixel that is refined to fewer.
 _MOST_STRAIGHT = 144
-
-# Number of paths whose radiance is evaluated at once.
-_CHUNK = 4096
 
 
 class KnownRendering(NamedTuple):
@@ -289,49 +281,6 @@ def render_known_camera(
     return KnownImage(rgb, linear, rays, dropped, casts)
 
 
-def shade(paths: LightPaths | PathEnds, radiance: Radiance, *, rays: int) -> Float[Array, "rays 3"]:
-    """Returns the linear RGB of rays: the sum over their paths of throughput times radiance.
-
-    This is a pure function, for use under jit, vmap and differentiation: with respect to the
-    radiance function's parameters, and to paths that have gradients (`follow_branch`,
-    `follow_main_branches`).
-
-    Args:
-      paths: paths of these rays, along one axis, or a single path. If `trace` or `follow_branch`
-        was mapped, map this function too.
-      radiance: function of origin and direction that returns linear RGB; it is evaluated at the
-        last segment of every path.
-      rays: number of rays that the paths belong to.
-
-    Raises:
-      ValueError: if the paths have more than one axis, the radiance function does not return
-        three numbers, or the radiance of an opaque part is unknown.
-
-    Example:
-      >>> import numpy as np
-      >>> import refref_jax
-      >>> from refref_jax.render import shade
-      >>> ray = refref_jax.Rays(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]), np.full(1, 1e-3))
-      >>> empty = refref_jax.assemble([])
-      >>> paths = refref_jax.trace(empty, ray, settings=refref_jax.PATH_PRESETS["straight"]).paths
-      >>> shade(paths, lambda origin, direction: 0.5 + 0.5 * direction, rays=1).tolist()
-      [[0.5, 0.5, 1.0]]
-    """
-    if paths.statuses.ndim > 1:
-        raise ValueError(
-            f"The paths have the axes {paths.statuses.shape}, but one axis is expected. Apply "
-            "jax.vmap to shade as well as to the function that traced the paths."
-        )
-    if paths.statuses.ndim == 0:
-        paths = jax.tree.map(lambda x: x[None], paths)
-    ends = light_paths.ends_of(paths) if isinstance(paths, LightPaths) else paths
-    exists = light_paths.exists(ends)
-    # Empty slots use the segment of the first path, so that the input of radiance is valid.
-    held = jnp.where(exists, jnp.arange(exists.shape[0], dtype=jnp.int32), 0)
-    ends = jax.tree.map(lambda x: x[held], ends)
-    return jax.ops.segment_sum(_light(radiance, ends, exists), ends.rays, num_segments=rays)
-
-
 def _as_argument(radiance: Radiance) -> Radiance:
     """Returns a radiance function as a pytree: a plain function cannot be an argument of jit."""
     plain = jax.tree_util.all_leaves([radiance])
@@ -416,7 +365,7 @@ def _render_tile(
         footprint="differential" if rough else "cone",
     )
     ends = traced.ends
-    linear = _sum_light(radiance, ends, count)
+    linear = backgrounds.sum_light(radiance, ends, count)
     exists = light_paths.exists(ends).astype(jnp.int32)
     seen = _Tile(
         rgb=jnp.clip(pixels.linear_to_srgb(linear), 0.0, 1.0),
@@ -425,63 +374,3 @@ def _render_tile(
         dropped=traced.dropped,
     )
     return seen, traced.casts
-
-
-def _sum_light(radiance: Radiance, ends: PathEnds, rays: int) -> Float[Array, "rays 3"]:
-    """Returns the linear RGB of each ray, evaluated in chunks up to the last path.
-
-    The list usually has many empty slots, and a texture lookup costs about as much as casting a
-    ray.
-    """
-    slots = ends.rays.shape[0]
-    chunk = min(_CHUNK, slots)
-    count = jnp.sum(light_paths.exists(ends), dtype=jnp.int32)
-
-    def add(state: tuple[Array, Array]) -> tuple[Array, Array]:
-        start, linear = state
-        index = start + jnp.arange(chunk, dtype=jnp.int32)
-        part = jax.tree.map(lambda x: x[jnp.minimum(index, slots - 1)], ends)
-        light = _light(radiance, part, index < count)
-        return start + chunk, linear.at[part.rays].add(light)
-
-    begin = jnp.zeros((), jnp.int32), jnp.zeros((rays, 3), ends.throughput.dtype)
-    return jax.lax.while_loop(lambda state: state[0] < count, add, begin)[1]
-
-
-def _light(
-    radiance: Radiance, ends: PathEnds, real: Bool[Array, " paths"]
-) -> Float[Array, "paths 3"]:
-    """Returns the contribution of each path to its ray; 0 for paths that are not `real`."""
-    seen = _seen(radiance, ends)
-    if seen.shape != ends.directions.shape:
-        raise ValueError(
-            f"The radiance function returned an array of shape {seen.shape[1:]} for one ray. "
-            "Return linear RGB, of shape (3,)."
-        )
-    if ends.stop is not None:
-        if ends.stop.radiance is None:
-            raise ValueError(
-                "Light may end on a part whose radiance is unknown. Give every opaque part a "
-                "radiance in scene.json, or train a field."
-            )
-        seen = jnp.where(jnp.isfinite(ends.stop.tau)[:, None], ends.stop.radiance, seen)
-    return jnp.where(real[:, None], ends.throughput * seen.astype(ends.throughput.dtype), 0.0)
-
-
-def _seen(radiance: Radiance, ends: PathEnds) -> Array:
-    """Returns the radiance at the end of each path.
-
-    It is the mean over four places of the path's footprint, if ray differentials are carried.
-    """
-    look = jax.vmap(radiance)
-    if ends.differentials.points.shape[1] == 0:
-        return look(ends.origins, ends.directions)
-
-    exact = functools.partial(jnp.einsum, precision=jax.lax.Precision.HIGHEST)
-
-    def look_beside(offset: Float[Array, "2"]) -> Array:
-        moved = jax.tree.map(lambda axes: exact("a,pax->px", offset, axes), ends.differentials)
-        directions = jax.vmap(numerics.normalize)(ends.directions + moved.directions)
-        return look(ends.origins + moved.points, directions)
-
-    return jnp.mean(jax.lax.map(look_beside, jnp.asarray(_QUADRANTS, ends.tau.dtype)), axis=0)

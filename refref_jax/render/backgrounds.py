@@ -7,17 +7,21 @@ one ray. `u` is 0 at the left edge of an image and 1 at the right, `v` is 0 at i
 that of the rays, with z up.
 
 All functions are differentiable with respect to ray and texels, with kinks at texel centres and at
-the edges of a cube. `radiance_of` converts a background to a function for `render_known`.
+the edges of a cube. `radiance_of` converts a background to a function for `render_known`, and
+`shade` evaluates such a function at the ends of light paths.
 """
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax import numerics
+from refref_jax.optics import light_paths
+from refref_jax.optics.light_paths import LightPaths, PathEnds
 from refref_jax.render import pixels
 from refref_jax.sampling import scene_bounds
 
@@ -49,6 +53,13 @@ class LinearTexture(NamedTuple):
 
 
 Texture = SrgbTexture | LinearTexture
+
+# Middles of the quadrants of a pixel, whose edges are root 3 times its ray differential.
+_MIDDLE = 3.0**0.5 / 4.0
+_QUADRANTS = [(-_MIDDLE, -_MIDDLE), (-_MIDDLE, _MIDDLE), (_MIDDLE, -_MIDDLE), (_MIDDLE, _MIDDLE)]
+
+# Number of paths whose radiance is evaluated at once.
+_CHUNK = 4096
 
 
 class CubeBackground(NamedTuple):
@@ -188,6 +199,70 @@ def environment_radiance(
     return _look(background.texture, direction)
 
 
+def shade(paths: LightPaths | PathEnds, radiance: Radiance, *, rays: int) -> Float[Array, "rays 3"]:
+    """Returns the linear RGB of rays: the sum over their paths of throughput times radiance.
+
+    This is a pure function, for use under jit, vmap and differentiation: with respect to the
+    radiance function's parameters, and to paths that have gradients (`follow_branch`,
+    `follow_main_branches`).
+
+    Args:
+      paths: paths of these rays, along one axis, or a single path. If `trace` or `follow_branch`
+        was mapped, map this function too.
+      radiance: function of origin and direction that returns linear RGB; it is evaluated at the
+        last segment of every path.
+      rays: number of rays that the paths belong to.
+
+    Raises:
+      ValueError: if the paths have more than one axis, the radiance function does not return
+        three numbers, or the radiance of an opaque part is unknown.
+
+    Example:
+      >>> import numpy as np
+      >>> import refref_jax
+      >>> from refref_jax.render import shade
+      >>> ray = refref_jax.Rays(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]), np.full(1, 1e-3))
+      >>> empty = refref_jax.assemble([])
+      >>> paths = refref_jax.trace(empty, ray, settings=refref_jax.PATH_PRESETS["straight"]).paths
+      >>> shade(paths, lambda origin, direction: 0.5 + 0.5 * direction, rays=1).tolist()
+      [[0.5, 0.5, 1.0]]
+    """
+    if paths.statuses.ndim > 1:
+        raise ValueError(
+            f"The paths have the axes {paths.statuses.shape}, but one axis is expected. Apply "
+            "jax.vmap to shade as well as to the function that traced the paths."
+        )
+    if paths.statuses.ndim == 0:
+        paths = jax.tree.map(lambda x: x[None], paths)
+    ends = light_paths.ends_of(paths) if isinstance(paths, LightPaths) else paths
+    exists = light_paths.exists(ends)
+    # Empty slots use the segment of the first path, so that the input of radiance is valid.
+    held = jnp.where(exists, jnp.arange(exists.shape[0], dtype=jnp.int32), 0)
+    ends = jax.tree.map(lambda x: x[held], ends)
+    return jax.ops.segment_sum(_light(radiance, ends, exists), ends.rays, num_segments=rays)
+
+
+def sum_light(radiance: Radiance, ends: PathEnds, rays: int) -> Float[Array, "rays 3"]:
+    """Returns the linear RGB of each ray, evaluated in chunks up to the last path.
+
+    The list usually has many empty slots, and a texture lookup costs about as much as casting a
+    ray.
+    """
+    slots = ends.rays.shape[0]
+    chunk = min(_CHUNK, slots)
+    count = jnp.sum(light_paths.exists(ends), dtype=jnp.int32)
+
+    def add(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        start, linear = state
+        index = start + jnp.arange(chunk, dtype=jnp.int32)
+        part = jax.tree.map(lambda x: x[jnp.minimum(index, slots - 1)], ends)
+        light = _light(radiance, part, index < count)
+        return start + chunk, linear.at[part.rays].add(light)
+
+    begin = jnp.zeros((), jnp.int32), jnp.zeros((rays, 3), ends.throughput.dtype)
+    return jax.lax.while_loop(lambda state: state[0] < count, add, begin)[1]
+
+
 def _from_centre(
     background: CubeBackground | SphereBackground, point: Float[Array, "3"]
 ) -> Float[Array, "3"]:
@@ -241,3 +316,42 @@ def _interpolate(
 
 def _mix(low: Float[Array, "3"], high: Float[Array, "3"], at: _Neighbours) -> Float[Array, "3"]:
     return low + at.fraction * (high - low)
+
+
+def _light(
+    radiance: Radiance, ends: PathEnds, real: Bool[Array, " paths"]
+) -> Float[Array, "paths 3"]:
+    """Returns the contribution of each path to its ray; 0 for paths that are not `real`."""
+    seen = _seen(radiance, ends)
+    if seen.shape != ends.directions.shape:
+        raise ValueError(
+            f"The radiance function returned an array of shape {seen.shape[1:]} for one ray. "
+            "Return linear RGB, of shape (3,)."
+        )
+    if ends.stop is not None:
+        if ends.stop.radiance is None:
+            raise ValueError(
+                "Light may end on a part whose radiance is unknown. Give every opaque part a "
+                "radiance in scene.json, or train a field."
+            )
+        seen = jnp.where(jnp.isfinite(ends.stop.tau)[:, None], ends.stop.radiance, seen)
+    return jnp.where(real[:, None], ends.throughput * seen.astype(ends.throughput.dtype), 0.0)
+
+
+def _seen(radiance: Radiance, ends: PathEnds) -> Array:
+    """Returns the radiance at the end of each path.
+
+    It is the mean over four places of the path's footprint, if ray differentials are carried.
+    """
+    look = jax.vmap(radiance)
+    if ends.differentials.points.shape[1] == 0:
+        return look(ends.origins, ends.directions)
+
+    exact = functools.partial(jnp.einsum, precision=jax.lax.Precision.HIGHEST)
+
+    def look_beside(offset: Float[Array, "2"]) -> Array:
+        moved = jax.tree.map(lambda axes: exact("a,pax->px", offset, axes), ends.differentials)
+        directions = jax.vmap(numerics.normalize)(ends.directions + moved.directions)
+        return look(ends.origins + moved.points, directions)
+
+    return jnp.mean(jax.lax.map(look_beside, jnp.asarray(_QUADRANTS, ends.tau.dtype)), axis=0)
