@@ -44,26 +44,30 @@ def check_precision(precision: str) -> None:
         )
 
 
-def dense(precision: Precision, *, hidden: bool = False) -> Callable[..., nn.Dense]:
-    """Returns flax's dense layer, `x @ kernel + bias`, with factors in a given precision.
-
-    Args:
-      precision: precision of the factors.
-      hidden: whether the result, which the next layer rounds anyway, is in that precision, too. It
-        is kept for the backward pass, where it is most of what a step reads and writes.
-    """
+def dense(precision: Precision) -> Callable[..., nn.Dense]:
+    """Returns flax's dense layer, `x @ kernel + bias`, with factors in a given precision."""
     if precision == "float32":
         return nn.Dense
-    if hidden:
-        return functools.partial(nn.Dense, dtype=jnp.bfloat16)
     return functools.partial(nn.Dense, dtype=jnp.float32, dot_general=_product)
 
 
-def dot_general(precision: Precision, *, hidden: bool = False) -> Callable[..., Array]:
-    """Returns `jax.lax.dot_general`, or one that rounds its factors; arguments as in `dense`."""
-    if precision == "float32":
-        return jax.lax.dot_general
-    return _rounded_product if hidden else _product
+def hidden_dense(precision: Precision) -> Callable[..., nn.Dense]:
+    """Returns a dense layer whose results, too, are in a given precision.
+
+    The next layer rounds them anyway. Until the backward pass they are kept, and they are most of
+    what a step reads and writes.
+    """
+    return nn.Dense if precision == "float32" else functools.partial(nn.Dense, dtype=jnp.bfloat16)
+
+
+def dot_general(precision: Precision) -> Callable[..., Array]:
+    """Returns `jax.lax.dot_general`, or one that rounds its factors to bfloat16."""
+    return jax.lax.dot_general if precision == "float32" else _product
+
+
+def hidden_dot_general(precision: Precision) -> Callable[..., Array]:
+    """Returns `jax.lax.dot_general`, or one that rounds its factors and results to bfloat16."""
+    return jax.lax.dot_general if precision == "float32" else _rounded_product
 
 
 def _product(left: Array, right: Array, axes: Any, precision: None = None) -> Array:

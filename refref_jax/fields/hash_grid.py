@@ -13,7 +13,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -23,7 +23,14 @@ from jaxtyping import Array, Float
 from refref_jax import numerics
 from refref_jax.choices import ColourNetwork, Precision
 from refref_jax.configuration import FORMERLY
-from refref_jax.fields.base import DensityConfig, RadianceConfig, dense, dot_general
+from refref_jax.fields.base import (
+    DensityConfig,
+    RadianceConfig,
+    dense,
+    dot_general,
+    hidden_dense,
+    hidden_dot_general,
+)
 from refref_jax.fields.hash_grid_kernels import interpolate
 from refref_jax.sampling.polylines import Gaussians
 
@@ -271,7 +278,7 @@ def grid_network(
     layer = dense(precision)
     features = MultisampledGrid(grid, precision)(gaussians)
     # Flax numbers layers in order of creation, and checkpoints contain these names.
-    hidden = nn.relu(dense(precision, hidden=True)(width)(features))
+    hidden = nn.relu(hidden_dense(precision)(width)(features))
     return layer(outputs)(hidden)
 
 
@@ -290,7 +297,7 @@ def density_and_colour(
       direction: unit direction of travel.
       config: shape of the field.
     """
-    layer, between = dense(config.precision), dense(config.precision, hidden=True)
+    layer, between = dense(config.precision), hidden_dense(config.precision)
     features = MultisampledGrid(config.grid, config.precision)(gaussians)
     hidden = nn.relu(between(config.density_width)(features))
     if config.colour_network == "skip" or not config.colour_depth:
@@ -299,14 +306,14 @@ def density_and_colour(
     encoded = spherical_harmonics(direction).astype(hidden.dtype)
     # Names are those that flax would give to layers, as checkpoints contain them.
     widths = config.bottleneck + encoded.size, config.colour_width
-    product = affine(config.precision)
+    layers = affine(config.precision)
     density, hidden = jax.lax.platform_dependent(
         hidden,
         encoded,
         _Weights(config.density_width, 1 + config.bottleneck, name="Dense_1")(),
         _Weights(*widths, name="Dense_2")(),
-        cpu=functools.partial(in_turn, product),
-        default=functools.partial(joined, product),
+        cpu=functools.partial(in_turn, layers),
+        default=functools.partial(joined, layers),
     )
     hidden = nn.relu(hidden)
     for i in range(1, config.colour_depth):
@@ -330,23 +337,37 @@ class _Weights(nn.Module):
 _Layer = tuple[Float[Array, "_ _"], Float[Array, " _"]]
 """Kernel and bias."""
 
-_Affine = Callable[..., Array]
-"""Product with a kernel, plus the bias; see `affine`."""
+_Apply = Callable[[Array, _Layer], Array]
+"""Product of a vector and a kernel, plus the bias."""
 
 
-def affine(precision: Precision) -> _Affine:
-    """Returns the function of a vector and a layer that flax's dense layer is; see `dense`."""
+class Affine(NamedTuple):
+    """What dense layers of flax do to a vector.
 
-    def apply(values: Array, layer: _Layer, *, hidden: bool = False) -> Array:
-        dot = dot_general(precision, hidden=hidden)
-        product = dot(values, layer[0], (((0,), (0,)), ((), ())), precision=None)
-        return product + layer[1].astype(product.dtype)
+    Attributes:
+      last: function of a vector and a layer whose result leaves the network, see `dense`.
+      hidden: the same for a layer that is followed by others, see `hidden_dense`.
+    """
 
-    return apply
+    last: _Apply
+    hidden: _Apply
+
+
+def affine(precision: Precision) -> Affine:
+    """Returns these functions for a precision."""
+
+    def using(dot: Callable[..., Array]) -> _Apply:
+        def apply(values: Array, layer: _Layer) -> Array:
+            product = dot(values, layer[0], (((0,), (0,)), ((), ())), precision=None)
+            return product + layer[1].astype(product.dtype)
+
+        return apply
+
+    return Affine(using(dot_general(precision)), using(hidden_dot_general(precision)))
 
 
 def in_turn(
-    apply: _Affine,
+    layers: Affine,
     hidden: Float[Array, " width"],
     encoded: Float[Array, "16"],
     head: _Layer,
@@ -355,21 +376,21 @@ def in_turn(
     """Returns density, and outputs of the first layer of colour, both without activation.
 
     Args:
-      apply: product of a vector and a layer, from `affine`.
+      layers: products of vectors and layers.
       hidden: outputs of the hidden layer of density.
       encoded: encoded direction.
       head: layer with the outputs density and bottleneck.
       first: layer of bottleneck and encoded direction.
     """
     with jax.named_scope("Dense_1"):
-        raw = apply(hidden, head)
+        raw = layers.last(hidden, head)
     with jax.named_scope("Dense_2"):
         inputs = jnp.concatenate([raw[1:].astype(encoded.dtype), encoded])
-        return raw[0], apply(inputs, first, hidden=True)
+        return raw[0], layers.hidden(inputs, first)
 
 
 def joined(
-    apply: _Affine,
+    layers: Affine,
     hidden: Float[Array, " width"],
     encoded: Float[Array, "16"],
     head: _Layer,
@@ -379,14 +400,14 @@ def joined(
     kernel, bias = head
     bottleneck = kernel.shape[1] - 1
     with jax.named_scope("Dense_1"):
-        density = apply(hidden, (kernel[:, :1], bias[:1]))[0]
+        density = layers.last(hidden, (kernel[:, :1], bias[:1]))[0]
     with jax.named_scope("Dense_2"):
         of_bottleneck, of_direction = first[0][:bottleneck], first[0][bottleneck:]
         both = numerics.product(kernel[:, 1:], of_bottleneck)
         shift = numerics.product(bias[1:], of_bottleneck) + first[1]
         inputs = jnp.concatenate([hidden, encoded])
         weights = jnp.concatenate([both, of_direction])
-        return density, apply(inputs, (weights, shift), hidden=True)
+        return density, layers.hidden(inputs, (weights, shift))
 
 
 def colour(
@@ -409,7 +430,7 @@ def directional_network(
 
     Source: Zip-NeRF's code in PyTorch, on which the paper's is based, for the skip connection.
     """
-    layer, between = dense(config.precision), dense(config.precision, hidden=True)
+    layer, between = dense(config.precision), hidden_dense(config.precision)
     inputs = hidden = jnp.concatenate([bottleneck, spherical_harmonics(direction)])
     for i in range(config.colour_depth):
         hidden = nn.relu(between(config.colour_width)(hidden))

@@ -60,11 +60,11 @@ def test_two_linear_layers_in_a_row_are_one(precision):
         shapes,
         is_leaf=lambda x: isinstance(x[0], int),
     )
-    apply = hash_grid.affine(precision)
+    affine = hash_grid.affine(precision)
 
     def value_and_slopes(layers):
         def squares(*arguments):
-            density, outputs = layers(apply, *arguments)
+            density, outputs = layers(affine, *arguments)
             return density**2 + jnp.sum(outputs.astype(jnp.float32) ** 2)
 
         return jax.jit(jax.value_and_grad(squares, argnums=(0, 1, 2, 3)))(*arguments)
