@@ -39,6 +39,14 @@ _INSTEAD = (
     "Call it outside, or use trace or follow_main_branches and shade, which are pure functions."
 )
 
+# Number of first rays of a pixel beside the objects, where others are refined: one ray would miss
+# edges of the background between pixels, and four cost a tenth of a bent one.
+_FEWEST_BESIDE = 4
+
+# The squared error of a pixel's mean over stratified rays falls with this power of their number,
+# where edges pass through it (Mitchell, Consequences of Stratified Sampling in Graphics, 1996).
+_ERROR_FALLS = 1.5
+
 # Largest number of rays for the background of a pixel that is refined to fewer.
 _MOST_STRAIGHT = 144
 
@@ -206,12 +214,13 @@ def render_known_camera(
 ) -> KnownImage:
     """Renders one camera's image in front of a known background, with several rays in every pixel.
 
-    With `refined_rays_per_pixel`, a pixel is rendered again with that many rays, which replace the
-    first ones, if one of its rays and the eight rays around it, some of them of the next pixels,
-    differ by more than `tolerance`. So edges, silhouettes and places where glass shrinks the
-    background get many rays, and smooth places few. Where a refined pixel shows the background
-    past the objects, up to four times as many rays measure it and its share of the pixel: one that
-    is not bent costs a thirtieth of the others.
+    With `refined_rays_per_pixel`, a pixel is rendered again with that many rays if one of its rays
+    and the eight rays around it, some of them of the next pixels, differ by more than `tolerance`.
+    So edges, silhouettes and places where glass shrinks the background get many rays, and smooth
+    places few. The first rays keep the weight that their number gives them. One that is not bent
+    costs a thirtieth of the others: pixels beside the objects have at least four first rays, and
+    where a refined pixel shows the background past the objects, up to four times as many rays
+    measure it and its share of the pixel, and replace the first ones.
 
     Args:
       scene: the scene.
@@ -248,37 +257,14 @@ def render_known_camera(
     """
     _check_refinement(rays_per_pixel, refined_rays_per_pixel, tolerance)
     scene, radiance = jax.device_put((scene, _as_argument(radiance)))
-
-    def see(row: np.ndarray, column: np.ndarray, count: int) -> tuple[KnownRendering, np.ndarray]:
-        rays = pinholes.rays_of_pixels(cameras, view, row, column, side=side_of(count))
-        listed = interior_list
-        if listed is not None:
-            listed = np.broadcast_to(listed, (*rays.radii.shape, *listed.shape))
-        return _render(scene, radiance, rays, settings, listed, tile)
-
-    row, column = np.indices((cameras.height, cameras.width))
-    seen, _ = see(row, column, rays_per_pixel)
-    casts, rays = seen.casts, np.full(row.shape, rays_per_pixel, np.int32)
-    linear, dropped = seen.linear.mean(axis=2), seen.dropped.mean(axis=2)
+    camera = _Camera(scene, radiance, cameras, view, settings, interior_list, tile)
+    refines = refined_rays_per_pixel is not None
+    image, rays = _first_image(camera, rays_per_pixel, _FEWEST_BESIDE if refines else 1)
     if refined_rays_per_pixel is not None:
-        many = max(refined_rays_per_pixel, min(4 * refined_rays_per_pixel, _MOST_STRAIGHT))
-        again = np.nonzero(_contrast(seen.rgb) > tolerance)
-        band = max(1, images.RAYS_OF_A_BAND // many)
-        for start in range(0, again[0].size, band):
-            here = again[0][start : start + band], again[1][start : start + band]
-            finer, met = see(*here, refined_rays_per_pixel)
-            casts, rays[here] = casts + finer.casts, refined_rays_per_pixel
-            linear[here], dropped[here] = finer.linear.mean(axis=1), finer.dropped.mean(axis=1)
-            beside = ~met.all(axis=1) & (many > refined_rays_per_pixel)
-            here = here[0][beside], here[1][beside]
-            straight = pinholes.rays_of_pixels(cameras, view, *here, side=side_of(many))
-            few = finer.linear[beside], finer.dropped[beside], met[beside]
-            linear[here], dropped[here] = _with_more_background(
-                scene, radiance, straight, *few, settings, tile
-            )
-            casts, rays[here] = casts + straight.radii.size * (settings.max_bends > 0), many
-    rgb = np.clip(np.asarray(pixels.linear_to_srgb(jax.device_put(linear))), 0.0, 1.0)
-    return KnownImage(rgb, linear, rays, dropped, casts)
+        again = np.nonzero(_contrast(rays) > tolerance)
+        image = _refined(camera, image, again, rays_per_pixel, refined_rays_per_pixel)
+    rgb = np.clip(np.asarray(pixels.linear_to_srgb(jax.device_put(image.linear))), 0.0, 1.0)
+    return image._replace(rgb=rgb)
 
 
 def _as_argument(radiance: Radiance) -> Radiance:
@@ -300,6 +286,86 @@ def _check_refinement(count: int, refined: int | None, tolerance: float) -> None
         )
 
 
+class _Camera(NamedTuple):
+    """One camera in front of a scene; attributes are arguments of `render_known_camera`."""
+
+    scene: Scene
+    radiance: Radiance
+    cameras: Cameras
+    view: int
+    settings: PathSettings
+    interior_list: Int[np.ndarray, " slots"] | None
+    tile: int
+
+    def rays(self, row: np.ndarray, column: np.ndarray, count: int) -> Rays:
+        """Returns a number of rays of each pixel, along the last axis."""
+        return pinholes.rays_of_pixels(self.cameras, self.view, row, column, side=side_of(count))
+
+    def render(
+        self, row: np.ndarray, column: np.ndarray, count: int
+    ) -> tuple[KnownRendering, Bool[np.ndarray, "*pixels rays"]]:
+        """Returns the rendering of these rays, and which meet an object."""
+        rays, listed = self.rays(row, column, count), self.interior_list
+        if listed is not None:
+            listed = np.broadcast_to(listed, (*rays.radii.shape, *listed.shape))
+        return _render(self.scene, self.radiance, rays, self.settings, listed, self.tile)
+
+
+def _first_image(
+    camera: _Camera, count: int, fewest: int
+) -> tuple[KnownImage, Float[np.ndarray, "h w rays 3"]]:
+    """Returns an image that is not encoded yet, and the colours of its rays.
+
+    Args:
+      camera: what is rendered.
+      count: number of rays in each pixel.
+      fewest: least number of rays in a pixel beside the objects; 4 at most.
+    """
+    row, column = np.indices((camera.cameras.height, camera.cameras.width))
+    seen, met = camera.render(row, column, count)
+    rgb, linear, dropped = seen.rgb, seen.linear.mean(axis=2), seen.dropped.mean(axis=2)
+    casts, rays = seen.casts, np.full(row.shape, count, np.int32)
+    if count < fewest:
+        beside = ~met.any(axis=2)
+        finer, _ = camera.render(row[beside], column[beside], fewest)
+        casts, rays[beside] = casts + finer.casts, fewest
+        linear[beside], dropped[beside] = finer.linear.mean(axis=1), finer.dropped.mean(axis=1)
+        rgb = np.repeat(rgb, fewest, axis=2)
+        rgb[beside] = finer.rgb
+    return KnownImage(linear, linear, rays, dropped, casts), rgb
+
+
+def _refined(
+    camera: _Camera, image: KnownImage, again: tuple[np.ndarray, ...], few: int, many: int
+) -> KnownImage:
+    """Renders pixels again with many rays; the arrays of the image change.
+
+    Args:
+      camera: what is rendered.
+      image: image of few rays in each pixel.
+      again: rows and columns of the pixels.
+      few: number of rays in each pixel so far.
+      many: number of rays in each pixel that is rendered again.
+    """
+    straight = max(many, min(4 * many, _MOST_STRAIGHT))
+    share = 1.0 / (1.0 + (few / many) ** _ERROR_FALLS)
+    band, casts = max(1, images.RAYS_OF_A_BAND // straight), image.casts
+    for start in range(0, again[0].size, band):
+        here = again[0][start : start + band], again[1][start : start + band]
+        finer, met = camera.render(*here, many)
+        for values, more in (image.linear, finer.linear), (image.dropped, finer.dropped):
+            values[here] += share * (more.mean(axis=1) - values[here])
+        image.rays[here] += many
+        beside = ~met.all(axis=1) & (straight > many)
+        here = here[0][beside], here[1][beside]
+        known = finer.linear[beside], finer.dropped[beside], met[beside]
+        rays = camera.rays(*here, straight)
+        image.linear[here], image.dropped[here] = _with_more_background(camera, rays, *known)
+        image.rays[here] = straight
+        casts += finer.casts + rays.radii.size * (camera.settings.max_bends > 0)
+    return image._replace(casts=casts)
+
+
 def _contrast(rgb: Float[np.ndarray, "h w rays 3"]) -> Float[np.ndarray, "h w"]:
     """Returns the largest range of any ray of a pixel and its neighbours, in any channel."""
     height, width, count, _ = rgb.shape
@@ -316,14 +382,11 @@ def _contrast(rgb: Float[np.ndarray, "h w rays 3"]) -> Float[np.ndarray, "h w"]:
 
 
 def _with_more_background(
-    scene: Scene,
-    radiance: Radiance,
+    camera: _Camera,
     rays: Rays,
     linear: Float[np.ndarray, "pixels few 3"],
     dropped: Float[np.ndarray, "pixels few 3"],
     met: Bool[np.ndarray, "pixels few"],
-    settings: PathSettings,
-    tile: int,
 ) -> tuple[Float[np.ndarray, "pixels 3"], Float[np.ndarray, "pixels 3"]]:
     """Returns mean colours and dropped throughput over many rays, of which straight are rendered.
 
@@ -333,9 +396,10 @@ def _with_more_background(
     Source: double sampling for stratification; Neyman, Contribution to the Theory of Sampling Human
     Populations (1938).
     """
-    straight = _in_tiles(scene, radiance, rays, None, settings=STRAIGHT, tile=tile).linear
+    scene, tile = camera.scene, camera.tile
+    straight = _in_tiles(scene, camera.radiance, rays, None, settings=STRAIGHT, tile=tile).linear
     hits = np.zeros(rays.radii.shape, bool)
-    if settings.max_bends > 0:
+    if camera.settings.max_bends > 0:
         hits, _, _ = images.split_by_hit(scene.surfaces, rays, tile=tile, instead=_INSTEAD)
     hits &= met.any(axis=1, keepdims=True)
     share = hits.mean(axis=1, keepdims=True) / np.maximum(1, met.sum(axis=1, keepdims=True))

@@ -271,6 +271,7 @@ def _with_more_background(scene, radiance, few, many):
     """Returns refined pixels, and which of them show the background past the objects.
 
     Of many rays those that meet an object have the mean colour of the few that do in their pixel.
+    Elsewhere the first four rays keep the weight of their number to the power of 1.5.
     """
     met, hits = (
         _by_pixel(
@@ -284,8 +285,9 @@ def _with_more_background(scene, radiance, few, many):
     for pixel in zip(*np.nonzero(met.any(axis=(2, 3))), strict=True):
         colours[pixel][hits[pixel]] = traced[pixel][met[pixel]].mean(axis=0)
     beside = ~met.all(axis=(2, 3))
-    means = (x.mean(axis=(2, 3)) for x in (colours, traced))
-    return np.where(beside[..., None], *means), beside
+    ratio = (few * few / 4) ** 1.5
+    both = (_uniform(scene, radiance, 2)[0] + ratio * traced.mean(axis=(2, 3))) / (1.0 + ratio)
+    return np.where(beside[..., None], colours.mean(axis=(2, 3)), both), beside
 
 
 @pytest.mark.slow
@@ -295,10 +297,10 @@ def test_pixels_whose_rays_differ_from_neighbours_get_more_rays(scene):
     high, low = (f(first, (3, 3, 1), mode="nearest") for f in (maximum_filter, minimum_filter))
     contrast = _by_pixel(high - low, 2).max(axis=(2, 3, 4))
     refined, beside = _with_more_background(scene, _stripes, 5, 10)
-    expected = np.where(contrast > 0.2, np.where(beside, 100, 25), 4)
+    expected = np.where(contrast > 0.2, np.where(beside, 100, 29), 4)
     clear = np.abs(contrast - 0.2) > 1e-5  # of rounding
     np.testing.assert_array_equal(seen.rays[clear], expected[clear])
-    assert set(np.unique(seen.rays)) == {4, 25, 100}
+    assert set(np.unique(seen.rays)) == {4, 29, 100}
     few = _uniform(scene, _stripes, 2)[0]
     linear = np.where(seen.rays[..., None] == 4, few, refined)
     np.testing.assert_allclose(seen.linear, linear, atol=1e-5)
@@ -310,8 +312,7 @@ def test_refined_pixels_are_nearer_to_the_truth_than_more_rays_everywhere(scene)
     seen = _image(scene, _stripes, refined_rays_per_pixel=36, tolerance=0.2)
     met = np.isfinite(images.find_first_surface(scene.surfaces, _rays(6)).distances)
     inside = met.reshape(12, 6, 12, 6).all(axis=(1, 3))
-    traced = seen.rays + 4.0 * (seen.rays > 4)
-    assert np.mean(traced[inside]) < 25.0
+    assert np.mean(seen.rays[inside]) < 25.0
     error, uniform = (
         np.sqrt(np.mean((x - truth) ** 2)) for x in (seen.linear, _uniform(scene, _stripes, 6)[0])
     )
@@ -322,8 +323,18 @@ def test_white_is_not_refined_and_zero_tolerance_refines_what_differs(scene):
     assert np.all(_image(scene, _WHITE, refined_rays_per_pixel=9).rays == 4)
     seen = _image(scene, _environment(), refined_rays_per_pixel=9, tolerance=0.0)
     expected, beside = _with_more_background(scene, _environment(), 3, 6)
-    np.testing.assert_array_equal(seen.rays, np.where(beside, 36, 9))
+    np.testing.assert_array_equal(seen.rays, np.where(beside, 36, 13))
     np.testing.assert_allclose(seen.linear, expected, atol=1e-5)
+
+
+def test_pixels_beside_the_objects_have_four_first_rays_where_others_are_refined(scene):
+    assert np.all(_image(scene, _WHITE, rays_per_pixel=1).rays == 1)
+    seen = _image(scene, _environment(), rays_per_pixel=1, refined_rays_per_pixel=4, tolerance=9.0)
+    met = np.isfinite(images.find_first_surface(scene.surfaces, _rays(1)).distances)
+    assert np.any(met) and not np.all(met)
+    np.testing.assert_array_equal(seen.rays, np.where(met, 1, 4))
+    one, four = (_uniform(scene, _environment(), side)[0] for side in (1, 2))
+    np.testing.assert_allclose(seen.linear, np.where(met[..., None], one, four), atol=1e-5)
 
 
 def test_straight_rays_are_refined_as_their_background(scene):
