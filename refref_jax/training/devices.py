@@ -6,7 +6,8 @@ summed over the devices. Without a mesh there is one device, and no such sum.
 """
 
 import contextlib
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import jax
 import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array
 
 AXIS = "devices"
 """Name of the mesh's only axis."""
@@ -198,3 +200,35 @@ def put_everywhere(tree: Any, *, mesh: Mesh | None) -> Any:
         return jax.make_array_from_callback(x.shape, sharding, lambda index: x[index])
 
     return jax.tree.map(put, jax.device_get(tree))
+
+
+def concatenated(groups: Iterable[Any], *, count: int) -> Any:
+    """Returns the first rows of pytrees of arrays, one after the other, with their sharding.
+
+    Every group is written to its place before the next one is made, so that the result and one
+    group are held.
+
+    Args:
+      groups: pytrees of the same structure and shapes; at least one.
+      count: number of rows of the result.
+    """
+    result, first = None, 0
+    for group in groups:
+        size = jax.tree.leaves(group)[0].shape[0]
+        if result is None:
+            result = jax.tree.map(functools.partial(_zeros, -(-count // size) * size), group)
+        result = _with_group(result, group, np.int32(first))
+        first += size
+    return jax.tree.map(lambda x: x[:count], result)
+
+
+def _zeros(rows: int, like: jax.Array) -> np.ndarray | jax.Array:
+    zeros = np.zeros((rows, *like.shape[1:]), like.dtype)
+    # An array that is bound to a device where others are not would be another program's.
+    return jax.device_put(zeros, like.sharding) if like.committed else zeros
+
+
+@functools.partial(jax.jit, donate_argnums=0)
+def _with_group(result: Any, group: Any, first: Array) -> Any:
+    put = functools.partial(jax.lax.dynamic_update_slice_in_dim, start_index=first, axis=0)
+    return jax.tree.map(put, result, group)

@@ -361,7 +361,7 @@ def set_up(
     """Moves the scene to the devices, and estimates the number of paths per ray.
 
     The light paths of all pixels are kept if the run uses them more than once and they take at most
-    half a gibibyte; while they are concatenated, three times that is in use. Where cores are free,
+    half a gibibyte; while the last ones are cut off, twice that is in use. Where cores are free,
     `beside` is called while they are traced, such as `compile_steps`.
     """
     scene = jax.device_put(scene)
@@ -495,5 +495,5 @@ def _trace_epoch(setup: Setup) -> PretracedBatches:
     """Traces all batches in groups; one that is full drops paths, which depend on the group."""
     size, batches = require(setup.config.schedule.pretraced_batches), setup.sampler.batches
     firsts = range(0, batches, size)
-    traced = [trace_batches(setup, range(first, first + size)) for first in firsts]
-    return jax.tree.map(lambda *parts: jnp.concatenate(parts)[:batches], *traced)
+    traced = (trace_batches(setup, range(first, first + size)) for first in firsts)
+    return devices.concatenated(traced, count=batches)

@@ -98,6 +98,21 @@ def test_arrays_are_put_on_every_device():
         assert all(leaf.is_fully_replicated for leaf in jax.tree.leaves(put))
 
 
+@pytest.mark.parametrize("count", [5, 6])
+@pytest.mark.parametrize("committed", [False, True])
+def test_groups_are_written_one_after_the_other(count, committed):
+    groups = [{"a": np.full((2, 3), n, np.float32), "b": np.arange(2, dtype=np.int32)} for n in range(3)]
+    place = jax.devices()[0] if committed else None
+    made = (jax.device_put(group, place) for group in groups)
+    result = devices.concatenated(made, count=count)
+    for name in ("a", "b"):
+        expected = np.concatenate([group[name] for group in groups])[:count]
+        np.testing.assert_array_equal(result[name], expected)
+        assert result[name].dtype == expected.dtype
+        # An array that is bound to its device would be compiled for again.
+        assert result[name].committed == committed
+
+
 def test_one_process_agrees_with_itself():
     assert devices.is_first()
     assert devices.any_process(True) and not devices.any_process(False)
