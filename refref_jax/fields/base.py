@@ -7,8 +7,9 @@ cube. A field kind is a `FieldKind` in a module, and one line in `registry`, thr
 modules query fields.
 
 The precision is float32, or mixed with bfloat16: tables are then read and matrices multiplied in
-bfloat16, while parameters, sums, gradients and outputs stay in float32. bfloat16 has only 8
-significant bits, so small gradients would be lost in a sum of many.
+bfloat16, and hidden layers of fields on a hash grid return it, while parameters, sums and outputs
+stay in float32. bfloat16 has only 8 significant bits, so small gradients would be lost in a sum of
+many.
 
 Source: Micikevicius et al., Mixed Precision Training (2018), for the float32 master weights.
 """
@@ -21,6 +22,7 @@ from typing import Any, NamedTuple, get_args
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float
 
 from refref_jax import numerics
@@ -51,13 +53,22 @@ def dense(precision: Precision) -> Callable[..., nn.Dense]:
     return functools.partial(nn.Dense, dtype=jnp.float32, dot_general=_product)
 
 
-def hidden_dense(precision: Precision) -> Callable[..., nn.Dense]:
-    """Returns a dense layer whose results, too, are in a given precision.
+def hidden_layer(precision: Precision) -> Callable[..., Callable[[Array], Array]]:
+    """Returns a dense layer with ReLU, as a function of the width and of flax's options.
 
-    The next layer rounds them anyway. Until the backward pass they are kept, and they are most of
-    what a step reads and writes.
+    In bfloat16, its product and its result are rounded, and the bias is added in between: the next
+    layer would round the result anyway. Both are kept for the backward pass, where they are most of
+    what a step reads and writes. A sum in bfloat16 would lose small gradients of the bias.
     """
-    return nn.Dense if precision == "float32" else functools.partial(nn.Dense, dtype=jnp.bfloat16)
+
+    def layer(width: int, **options: Any) -> Callable[[Array], Array]:
+        if precision == "float32":
+            exact = nn.Dense(width, **options)
+            return lambda values: nn.relu(exact(values))
+        rounded = nn.Dense(width, dtype=jnp.float32, dot_general=_rounded_product, **options)
+        return lambda values: nn.relu(rounded(values)).astype(jnp.bfloat16)
+
+    return layer
 
 
 def dot_general(precision: Precision) -> Callable[..., Array]:
@@ -70,16 +81,23 @@ def hidden_dot_general(precision: Precision) -> Callable[..., Array]:
     return jax.lax.dot_general if precision == "float32" else _rounded_product
 
 
+def between_layers(precision: Precision) -> DTypeLike:
+    """Returns the type of what one layer passes to the next."""
+    return jnp.float32 if precision == "float32" else jnp.bfloat16
+
+
 def _product(left: Array, right: Array, axes: Any, precision: None = None) -> Array:
     """Returns the matrix product of factors rounded to bfloat16, in single precision."""
-    return _rounded_product(left, right, axes, precision, preferred_element_type=jnp.float32)
-
-
-def _rounded_product(
-    left: Array, right: Array, axes: Any, precision: None = None, **options: Any
-) -> Array:
     factors = left.astype(jnp.bfloat16), right.astype(jnp.bfloat16)
-    return jax.lax.dot_general(*factors, axes, precision=precision, **options)
+    return jax.lax.dot_general(
+        *factors, axes, precision=precision, preferred_element_type=jnp.float32
+    )
+
+
+def _rounded_product(left: Array, right: Array, axes: Any, precision: None = None) -> Array:
+    """Returns this product rounded to bfloat16, in single precision."""
+    factors = left.astype(jnp.bfloat16), right.astype(jnp.bfloat16)
+    return jax.lax.dot_general(*factors, axes, precision=precision).astype(jnp.float32)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -26,10 +26,11 @@ from refref_jax.configuration import FORMERLY
 from refref_jax.fields.base import (
     DensityConfig,
     RadianceConfig,
+    between_layers,
     dense,
     dot_general,
-    hidden_dense,
     hidden_dot_general,
+    hidden_layer,
 )
 from refref_jax.fields.hash_grid_kernels import interpolate
 from refref_jax.sampling.polylines import Gaussians
@@ -278,7 +279,7 @@ def grid_network(
     layer = dense(precision)
     features = MultisampledGrid(grid, precision)(gaussians)
     # Flax numbers layers in order of creation, and checkpoints contain these names.
-    hidden = nn.relu(hidden_dense(precision)(width)(features))
+    hidden = hidden_layer(precision)(width)(features)
     return layer(outputs)(hidden)
 
 
@@ -297,9 +298,9 @@ def density_and_colour(
       direction: unit direction of travel.
       config: shape of the field.
     """
-    layer, between = dense(config.precision), hidden_dense(config.precision)
+    layer, between = dense(config.precision), hidden_layer(config.precision)
     features = MultisampledGrid(config.grid, config.precision)(gaussians)
-    hidden = nn.relu(between(config.density_width)(features))
+    hidden = between(config.density_width)(features)
     if config.colour_network == "skip" or not config.colour_depth:
         raw = layer(1 + config.bottleneck)(hidden)
         return raw[0], colour(raw[1:], direction, config)
@@ -317,7 +318,7 @@ def density_and_colour(
     )
     hidden = nn.relu(hidden)
     for i in range(1, config.colour_depth):
-        hidden = nn.relu(between(config.colour_width, name=f"Dense_{2 + i}")(hidden))
+        hidden = between(config.colour_width, name=f"Dense_{2 + i}")(hidden)
     return density, jax.nn.sigmoid(layer(3, name=f"Dense_{2 + config.colour_depth}")(hidden))
 
 
@@ -340,13 +341,16 @@ _Layer = tuple[Float[Array, "_ _"], Float[Array, " _"]]
 _Apply = Callable[[Array, _Layer], Array]
 """Product of a vector and a kernel, plus the bias."""
 
+_ALONG_FIRST = (((0,), (0,)), ((), ()))
+"""Axes of both factors that a product sums over, as in `jax.lax.dot_general`."""
+
 
 class Affine(NamedTuple):
     """What dense layers of flax do to a vector.
 
     Attributes:
       last: function of a vector and a layer whose result leaves the network, see `dense`.
-      hidden: the same for a layer that is followed by others, see `hidden_dense`.
+      hidden: the same for a layer that is followed by others, see `hidden_layer`.
     """
 
     last: _Apply
@@ -356,14 +360,14 @@ class Affine(NamedTuple):
 def affine(precision: Precision) -> Affine:
     """Returns these functions for a precision."""
 
-    def using(dot: Callable[..., Array]) -> _Apply:
-        def apply(values: Array, layer: _Layer) -> Array:
-            product = dot(values, layer[0], (((0,), (0,)), ((), ())), precision=None)
-            return product + layer[1].astype(product.dtype)
+    def last(values: Array, layer: _Layer) -> Array:
+        return dot_general(precision)(values, layer[0], _ALONG_FIRST, precision=None) + layer[1]
 
-        return apply
+    def hidden(values: Array, layer: _Layer) -> Array:
+        product = hidden_dot_general(precision)(values, layer[0], _ALONG_FIRST, precision=None)
+        return (product + layer[1]).astype(between_layers(precision))
 
-    return Affine(using(dot_general(precision)), using(hidden_dot_general(precision)))
+    return Affine(last, hidden)
 
 
 def in_turn(
@@ -430,10 +434,10 @@ def directional_network(
 
     Source: Zip-NeRF's code in PyTorch, on which the paper's is based, for the skip connection.
     """
-    layer, between = dense(config.precision), hidden_dense(config.precision)
+    layer, between = dense(config.precision), hidden_layer(config.precision)
     inputs = hidden = jnp.concatenate([bottleneck, spherical_harmonics(direction)])
     for i in range(config.colour_depth):
-        hidden = nn.relu(between(config.colour_width)(hidden))
+        hidden = between(config.colour_width)(hidden)
         if i == 0 and config.colour_network == "skip":
             hidden = jnp.concatenate([hidden, inputs.astype(hidden.dtype)])
     return layer(outputs)(hidden)

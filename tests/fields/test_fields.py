@@ -1,6 +1,7 @@
 import dataclasses
 import functools
 import itertools
+import re
 
 import jax
 import jax.numpy as jnp
@@ -307,6 +308,19 @@ def test_half_precision_is_finite(name, size, scale):
     params = jax.tree.map(lambda x: jnp.asarray(size * np.asarray(x)), _parameters(name))
     seen, slopes = _taught(name, "bfloat16", params, _gaussians(scale=scale))
     assert gradients.all_finite(seen) and gradients.all_finite(slopes)
+
+
+@pytest.mark.parametrize("name", ["density", "radiance"])
+@pytest.mark.parametrize("platform", ["cpu", "cuda"])
+def test_hidden_layers_keep_bfloat16_and_no_sum_is_in_it(name, platform):
+    learn = jax.jit(_learning(name, "bfloat16"))
+    traced = learn.trace(_parameters(name), _gaussians(), _direction())
+    text = traced.lower(lowering_platforms=(platform,)).as_text()
+    products = re.findall(r"stablehlo.dot_general .*", text)
+    assert any(each.rstrip().endswith("xbf16>") for each in products)
+    assert any(each.rstrip().endswith("xf32>") for each in products)
+    sums = re.findall(r"stablehlo.reduce\(.*", text)
+    assert sums and not any("bf16" in each for each in sums)
 
 
 def test_unknown_precisions_are_refused():
