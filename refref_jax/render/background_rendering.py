@@ -40,7 +40,7 @@ _INSTEAD = (
 )
 
 # Number of first rays of a pixel beside the objects, where others are refined: one ray would miss
-# edges of the background between pixels, and four cost a tenth of a bent one.
+# edges of the background between pixels, and four cost less than a fifth of a bent one.
 _FEWEST_BESIDE = 4
 
 # The squared error of a pixel's mean over stratified rays falls with this power of their number,
@@ -71,13 +71,13 @@ class KnownRendering(NamedTuple):
 
 
 class KnownImage(NamedTuple):
-    """A rendered image, each of whose pixels is the mean over its rays.
+    """A rendered image: means over the rays of each pixel, weighted where pixels were refined.
 
     Attributes:
       rgb: sRGB colours in `[0, 1]`.
       linear: linear RGB colours, not clipped.
-      rays: number of rays that each pixel is the mean of, with those of the background alone.
-      dropped: dropped throughput, as in `KnownRendering`, mean over those rays.
+      rays: number of rays that give each pixel its colour, with those of the background alone.
+      dropped: dropped throughput, as in `KnownRendering`, the same mean.
       casts: total number of closest-hit queries, with those of replaced rays.
     """
 
@@ -262,7 +262,7 @@ def render_known_camera(
     image, rays = _first_image(camera, rays_per_pixel, _FEWEST_BESIDE if refines else 1)
     if refined_rays_per_pixel is not None:
         again = np.nonzero(_contrast(rays) > tolerance)
-        image = _refined(camera, image, again, rays_per_pixel, refined_rays_per_pixel)
+        image = _refined(camera, image, again, refined_rays_per_pixel)
     rgb = np.clip(np.asarray(pixels.linear_to_srgb(jax.device_put(image.linear))), 0.0, 1.0)
     return image._replace(rgb=rgb)
 
@@ -319,13 +319,14 @@ def _first_image(
     Args:
       camera: what is rendered.
       count: number of rays in each pixel.
-      fewest: least number of rays in a pixel beside the objects; 4 at most.
+      fewest: least number of rays in a pixel beside the objects; above 1, `count` must be 1, since
+        rays of other pixels are repeated.
     """
     row, column = np.indices((camera.cameras.height, camera.cameras.width))
     seen, met = camera.render(row, column, count)
     rgb, linear, dropped = seen.rgb, seen.linear.mean(axis=2), seen.dropped.mean(axis=2)
     casts, rays = seen.casts, np.full(row.shape, count, np.int32)
-    if count < fewest:
+    if count < fewest:  # a square below four: one
         beside = ~met.any(axis=2)
         finer, _ = camera.render(row[beside], column[beside], fewest)
         casts, rays[beside] = casts + finer.casts, fewest
@@ -336,7 +337,7 @@ def _first_image(
 
 
 def _refined(
-    camera: _Camera, image: KnownImage, again: tuple[np.ndarray, ...], few: int, many: int
+    camera: _Camera, image: KnownImage, again: tuple[np.ndarray, ...], many: int
 ) -> KnownImage:
     """Renders pixels again with many rays; the arrays of the image change.
 
@@ -344,17 +345,16 @@ def _refined(
       camera: what is rendered.
       image: image of few rays in each pixel.
       again: rows and columns of the pixels.
-      few: number of rays in each pixel so far.
       many: number of rays in each pixel that is rendered again.
     """
     straight = max(many, min(4 * many, _MOST_STRAIGHT))
-    share = 1.0 / (1.0 + (few / many) ** _ERROR_FALLS)
     band, casts = max(1, images.RAYS_OF_A_BAND // straight), image.casts
     for start in range(0, again[0].size, band):
         here = again[0][start : start + band], again[1][start : start + band]
         finer, met = camera.render(*here, many)
+        share = 1.0 / (1.0 + (image.rays[here] / many) ** _ERROR_FALLS)[:, None]
         for values, more in (image.linear, finer.linear), (image.dropped, finer.dropped):
-            values[here] += share * (more.mean(axis=1) - values[here])
+            values[here] = (1.0 - share) * values[here] + share * more.mean(axis=1)
         image.rays[here] += many
         beside = ~met.all(axis=1) & (straight > many)
         here = here[0][beside], here[1][beside]

@@ -337,6 +337,33 @@ def test_pixels_beside_the_objects_have_four_first_rays_where_others_are_refined
     np.testing.assert_allclose(seen.linear, np.where(met[..., None], one, four), atol=1e-5)
 
 
+def test_the_weight_of_first_rays_is_that_of_their_number():
+    empty = refref_jax.assemble([])
+    ahead = cameras.Cameras(np.eye(4, dtype=np.float32)[None, :3], 8, 8, 8.0)
+
+    def see(**options):
+        return render_known_camera(empty, half, ahead, 0, settings=TREE, tile=_TILE, **options)
+
+    def half(origin, direction):
+        return jnp.where(direction[0] > 0.05, 0.9, 0.1) + 0.0 * origin
+
+    seen = see(rays_per_pixel=1, refined_rays_per_pixel=144)
+    four, many = (see(rays_per_pixel=count).linear for count in (4, 144))
+    refined = seen.rays == 148
+    assert np.any(refined) and np.all(seen.rays[~refined] == 4)
+    ratio = (144 / 4) ** 1.5
+    expected = np.where(refined[..., None], (four + ratio * many) / (1.0 + ratio), four)
+    np.testing.assert_allclose(seen.linear, expected, atol=1e-5)
+
+
+def test_infinite_light_is_infinite_in_refined_pixels(scene):
+    def sun(origin, direction):
+        return jnp.where(direction[0] > 0.0, jnp.inf, 0.5) + 0.0 * origin
+
+    seen = _image(scene, sun, refined_rays_per_pixel=9)
+    assert np.any(np.isinf(seen.linear)) and not np.any(np.isnan(seen.linear))
+
+
 def test_straight_rays_are_refined_as_their_background(scene):
     options = {"settings": STRAIGHT, "refined_rays_per_pixel": 100, "tolerance": 0.0}
     seen = render_known_camera(scene, _environment(), _CAMERA, 0, tile=_TILE, **options)
