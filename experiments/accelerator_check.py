@@ -74,12 +74,12 @@ def main() -> None:
                 results.append(report.run_part(part, context))
                 bar.show(len(results), part.name)
                 print(report.in_words(results[-1]), flush=True)
-        report.write(draft, context, results)
+        report.write(draft, context, results, parts=len(everything))
     for line in report.with_verdict(results, "problem", "failed"):
         print(line)
     print(f"{report.summary(results)}.")
     print(f"Report:   {out / 'report.md'}, {out / 'report.json'}")
-    if context.compares:
+    if context.compares and len(results) == len(everything):
         print("Please attach both to an issue of the project.")
     options = (f"--scene={_SCENE}", f"--preset={usual[-1]}", "--out=runs/ball")
     print(f"Next: {app.shell('train', *options)}")

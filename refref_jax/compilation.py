@@ -40,33 +40,33 @@ class XlaFlag(NamedTuple):
     Attributes:
       text: flag and value.
       versions: versions of jaxlib that need it; others may refuse it.
-      enough: parts of flags with the same effect, or by which users choose for themselves.
-      otherwise: what happens without it.
-      source: where this is known from.
+      suffices: parts of flags with the same effect, or by which users choose for themselves.
+      problem: what happens without it.
+      source: issue that reports the problem.
     """
 
     text: str
     versions: tuple[str, ...]
-    enough: tuple[str, ...]
-    otherwise: str
+    suffices: tuple[str, ...]
+    problem: str
     source: str
 
 
 ATOMICS_FLAG = XlaFlag(
     "--xla_backend_extra_options=-nvptx-allow-ftz-atomics",
     versions=("0.10.2", "0.11.0"),
-    enough=("nvptx-allow-ftz-atomics", "--xla_gpu_ftz=true"),
-    otherwise="scatter-adds compare and swap",
+    suffices=("nvptx-allow-ftz-atomics", "--xla_gpu_ftz=true"),
+    problem="scatter-adds compare and swap",
     source="jax-ml/jax#38806",
 )
-"""Makes `atom.add.f32` of `atom.cas.b32` in the PTX of jaxlib 0.10.2 for an H100
+"""Turns `atom.cas.b32` into `atom.add.f32` in the PTX of jaxlib 0.10.2 for an H100
 (`benchmarks.gpu_scatter_adds`)."""
 
 AUTOTUNER_FLAG = XlaFlag(
     "--xla_gpu_experimental_enable_fusion_autotuner=false",
     versions=("0.10.0", "0.10.1", "0.10.2", "0.11.0", "0.11.1", "0.11.2"),
-    enough=("--xla_gpu_experimental_enable_fusion_autotuner",),
-    otherwise="large training steps compile for minutes",
+    suffices=("--xla_gpu_experimental_enable_fusion_autotuner",),
+    problem="large training steps compile for minutes",
     source="tue-bmd/zea#599",
 )
 """Reductions are then not compiled in several ways to choose from."""
@@ -151,7 +151,7 @@ def missing_flags() -> tuple[XlaFlag, ...]:
         return ()
     flags, version = os.environ.get("XLA_FLAGS", ""), _version("jaxlib")
     needed = (each for each in NEEDED_FLAGS if version in each.versions)
-    return tuple(each for each in needed if not any(part in flags for part in each.enough))
+    return tuple(each for each in needed if not any(part in flags for part in each.suffices))
 
 
 def chosen_by_platform(
@@ -282,18 +282,25 @@ def add_missing_flags() -> None:
     """Sets the flags of XLA that this version needs on NVIDIA GPUs (`NEEDED_FLAGS`).
 
     Does nothing without a CUDA plugin. JAX reads flags when it starts, that is, with the first
-    array: later, or if the flag's name has another value already, a warning says what to do.
+    array: later, if it uses a GPU, and where a flag has another value already, a warning says what
+    to do.
     """
+    started, late = has_started(), []
+    if started and jax.default_backend() != "gpu":
+        return
     for flag in missing_flags():
         flags, name = os.environ.get("XLA_FLAGS", ""), flag.text.split("=")[0]
-        if has_started() or name in flags:
-            warnings.warn(
-                f"jaxlib {_version('jaxlib')} is slow on NVIDIA GPUs: {flag.otherwise}. Set "
-                f"XLA_FLAGS={flag.text} before JAX starts ({flag.source}).",
-                stacklevel=3,
-            )
-            continue
-        os.environ["XLA_FLAGS"] = f"{flags} {flag.text}".strip()
+        if started or name in flags:
+            late.append(flag)
+        else:
+            os.environ["XLA_FLAGS"] = f"{flags} {flag.text}".strip()
+    if late:
+        problems = "; ".join(f"{flag.problem} ({flag.source})" for flag in late)
+        warnings.warn(
+            f"jaxlib {_version('jaxlib')} is slow on NVIDIA GPUs: {problems}. Add to the variable "
+            f"XLA_FLAGS before JAX starts: {' '.join(flag.text for flag in late)}",
+            stacklevel=3,
+        )
 
 
 def chosen_traversal() -> Literal["xla", "warp"]:

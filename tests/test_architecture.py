@@ -53,6 +53,7 @@ _MAY_JIT = {
     "render/pixel_paths.py",
     "splats/images.py",
     "splats/training.py",
+    "training/devices.py",
     "training/loop.py",
     "training/evaluation.py",
     "reconstruct/occupancy.py",

@@ -85,15 +85,20 @@ def test_flags_with_the_same_effect_are_left_alone(installed, monkeypatch, flags
 
 def test_a_warning_says_what_to_do_where_it_is_too_late(installed, monkeypatch):
     monkeypatch.setattr(compilation, "has_started", lambda: True)
-    with pytest.warns(UserWarning, match=r"jaxlib 0\.10\.2 is slow on NVIDIA.*before JAX starts"):
+    compilation.add_missing_flags()  # no GPU is in use
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    with pytest.warns(UserWarning, match=r"jaxlib 0\.10\.2 is slow on NVIDIA") as told:
         compilation.add_missing_flags()
+    assert [str(each.message).partition("JAX starts: ")[2] for each in told] == [
+        f"{_FLAG} {_NO_AUTOTUNER}"
+    ]
     assert os.environ["XLA_FLAGS"] == "--xla_dump_to=here"
 
 
 def test_other_options_of_the_same_flag_are_not_overwritten(installed, monkeypatch):
     flags = f"--xla_backend_extra_options=-x {_NO_AUTOTUNER}"
     monkeypatch.setenv("XLA_FLAGS", flags)
-    with pytest.warns(UserWarning, match="Set XLA_FLAGS=.*nvptx"):
+    with pytest.warns(UserWarning, match="Add to the variable XLA_FLAGS.*nvptx"):
         compilation.add_missing_flags()
     assert os.environ["XLA_FLAGS"] == flags
 

@@ -88,7 +88,7 @@ def chosen(parts: Sequence[Part], headings: Sequence[str]) -> tuple[Part, ...]:
       ValueError: if a heading begins no name.
     """
     for heading in headings:
-        if not any(part.name.lower().startswith(heading.lower()) for part in parts):
+        if not heading or not any(part.name.lower().startswith(heading.lower()) for part in parts):
             names = ", ".join(part.name for part in parts)
             raise ValueError(f"--parts: no part begins with {heading!r}. There are: {names}.")
     begins = tuple(heading.lower() for heading in headings)
@@ -116,11 +116,14 @@ def describe(context: Context) -> str:
 
 def in_words(result: Result) -> str:
     """Returns the lines of a part as text, with verdicts where there are any, and its duration."""
-    lines = [
-        f"  {row.name}: {_value(row)}" + f"  {row.verdict}" * (row.verdict != "-")
-        for row in result.rows
-    ]
+    lines = [f"  {row.name}: {_value(row)}" + _verdict(row) for row in result.rows]
     return "\n".join([*lines, f"  in {result.seconds:.0f} s"])
+
+
+def _verdict(row: Row) -> str:
+    if row.verdict == "-":
+        return ""
+    return f"  {row.verdict}" + f" ({row.note})" * bool(row.note)
 
 
 def with_verdict(results: Sequence[Result], *verdicts: str) -> list[str]:
@@ -139,12 +142,20 @@ def summary(results: Sequence[Result]) -> str:
     return f"{ok} ok, {problems} {'problem' if problems == 1 else 'problems'}, {failed} failed"
 
 
-def write(folder: Path, context: Context, results: Sequence[Result]) -> None:
-    """Writes `report.md` and `report.json` into a folder."""
+def write(folder: Path, context: Context, results: Sequence[Result], *, parts: int) -> None:
+    """Writes `report.md` and `report.json` into a folder.
+
+    Args:
+      folder: folder to write to.
+      context: what was checked.
+      results: results of the parts that ran.
+      parts: number of parts that there are.
+    """
     bad = with_verdict(results, "problem", "failed")
     told, taken = describe(context), sum(result.seconds for result in results)
     lines = ["# Accelerator check", "", f"{told[:1].upper()}{told[1:]}.", ""]
-    lines += [f"In {taken:.0f} s: {summary(results)}.", ""]
+    ran = "all parts" if len(results) == parts else f"{len(results)} of {parts} parts"
+    lines += [f"In {taken:.0f} s, {ran}: {summary(results)}.", ""]
     lines += [f"- {line}" for line in bad] + [""] * bool(bad) + [_LEGEND]
     for result in results:
         lines += [f"## {result.name}", "", _HEADER]
@@ -154,6 +165,7 @@ def write(folder: Path, context: Context, results: Sequence[Result]) -> None:
     content = {
         "version": VERSION,
         "compared": describe(context),
+        "complete": len(results) == parts,
         "parts": [
             result._asdict() | {"rows": [row._asdict() for row in result.rows]}
             for result in results

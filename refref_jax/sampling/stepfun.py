@@ -148,11 +148,12 @@ def blurred_mass_below(
 def count_below(
     sorted_values: Float[Array, "*batch n"], queries: Float[Array, "*batch m"]
 ) -> Int[Array, "*batch m"]:
-    """Returns the number of values <= each query: a right-sided search by brute force.
+    """Returns the number of values <= each query: a right-sided search.
 
-    For the few dozen bins of a path this is faster than a binary search, whose steps are
-    sequential. Off CPUs it has two steps, among the ends of blocks and in a block: else XLA keeps
-    all that it compares in registers, many more than a GPU has, and compiles that for a minute.
+    On CPUs all values are compared, which for the few dozen bins of a path is faster than a binary
+    search, whose steps are sequential. Elsewhere there are two steps, among the ends of blocks and
+    in a block: otherwise XLA keeps every comparison in registers, more than a GPU has, and takes a
+    minute to compile that.
     """
     return jax.lax.platform_dependent(
         sorted_values, queries, cpu=_count_at_once, default=_count_in_blocks

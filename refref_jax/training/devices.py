@@ -2,7 +2,8 @@
 
 A *mesh* is a row of devices, of one process or of several. Every device holds all parameters, and
 an equal share of the light paths of every batch; the sums over paths, and their gradients, are
-summed over the devices. Without a mesh there is one device, and no such sum.
+summed over the devices. Without a mesh there is one device, and no such sum. This is one of the
+modules that call `jax.jit`.
 """
 
 import contextlib

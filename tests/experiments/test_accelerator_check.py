@@ -87,7 +87,7 @@ def test_parts_that_train_nothing_are_reported_and_agree(tmp_path, monkeypatch):
     parts = report.parts_of(["tiny"])[:3]
     results = [report.run_part(part, context) for part in parts]
     assert not report.with_verdict(results, "problem", "failed")
-    report.write(tmp_path, context, results)
+    report.write(tmp_path, context, results, parts=12)
     text = (tmp_path / "report.md").read_text("utf-8")
     for result in results:
         assert f"## {result.name}\n" in text and result.rows
@@ -101,14 +101,21 @@ def test_parts_are_chosen_by_the_beginnings_of_their_headings():
     chosen = report.chosen(parts, ["memory", "Preset paper: t"])
     assert [part.name.partition(":")[0] for part in chosen] == ["Memory", *2 * ["Preset paper"]]
     assert report.chosen(parts, []) == parts
-    with pytest.raises(ValueError, match=r"no part begins with 'memry'\. There are: Environment"):
-        report.chosen(parts, ["memry"])
+    for wrong in (["memry"], ["memory", ""]):
+        with pytest.raises(
+            ValueError, match=rf"no part begins with '{wrong[-1]}'\. There are: Env"
+        ):
+            report.chosen(parts, wrong)
 
 
 def test_a_finished_part_is_told_with_verdicts_and_seconds():
-    rows = (Row("rate", 2.5, "GB/s"), Row("rays", 1024, "", "ok"), Row("error", "none", "", "-"))
+    rows = (
+        Row("rate", 2.5, "GB/s"),
+        Row("rays", 1024, "", "ok"),
+        Row("off", 0.1, "", "problem", "why"),
+    )
     told = report.in_words(report.Result("Memory", 2.4, rows))
-    assert told == "  rate: 2.5 GB/s\n  rays: 1,024  ok\n  error: none\n  in 2 s"
+    assert told == "  rate: 2.5 GB/s\n  rays: 1,024  ok\n  off: 0.1  problem (why)\n  in 2 s"
 
 
 def test_a_gradient_with_one_wrong_array_is_found():
@@ -134,7 +141,7 @@ def test_a_part_that_fails_is_a_line_of_the_report(tmp_path):
     assert report.with_verdict([result], "failed") == [
         "failed: Broken: error: MemoryError: no more than this"
     ]
-    report.write(tmp_path, context, [result])
+    report.write(tmp_path, context, [result], parts=1)
     assert "| error | MemoryError: no more than this |" in (tmp_path / "report.md").read_text()
     assert json.loads((tmp_path / "report.json").read_text())["parts"][0]["name"] == "Broken"
 
@@ -143,6 +150,8 @@ def test_values_that_are_not_finite_are_written_and_are_problems(tmp_path):
     row = comparisons.limited("off", float("nan"), 1.0)
     assert row.verdict == "problem"
     cpu = jax.devices("cpu")[0]
-    report.write(tmp_path, Context(cpu, cpu, ROOT, 4), [report.Result("Part", 0.0, (row,))])
+    report.write(
+        tmp_path, Context(cpu, cpu, ROOT, 4), [report.Result("Part", 0.0, (row,))], parts=1
+    )
     (part,) = json.loads((tmp_path / "report.json").read_text())["parts"]
     assert part["rows"][0]["value"] == "nan"

@@ -101,7 +101,9 @@ def test_arrays_are_put_on_every_device():
 @pytest.mark.parametrize("count", [5, 6])
 @pytest.mark.parametrize("committed", [False, True])
 def test_groups_are_written_one_after_the_other(count, committed):
-    groups = [{"a": np.full((2, 3), n, np.float32), "b": np.arange(2, dtype=np.int32)} for n in range(3)]
+    groups = [
+        {"a": np.full((2, 3), n, np.float32), "b": np.arange(2, dtype=np.int32)} for n in range(3)
+    ]
     place = jax.devices()[0] if committed else None
     made = (jax.device_put(group, place) for group in groups)
     result = devices.concatenated(made, count=count)
