@@ -204,14 +204,14 @@ def put_everywhere(tree: Any, *, mesh: Mesh | None) -> Any:
 
 
 def concatenated(groups: Iterable[Any], *, count: int) -> Any:
-    """Returns the first rows of pytrees of arrays, one after the other, with their sharding.
+    """Concatenates groups of arrays along their first axis, with their sharding.
 
-    Every group is written to its place before the next one is made, so that the result and one
-    group are held.
+    Each group is written to its place before the next one is made, so that memory holds the result
+    and one group.
 
     Args:
       groups: pytrees of the same structure and shapes; at least one.
-      count: number of rows of the result.
+      count: number of rows of the result; further rows of the last group are cut off.
     """
     result, first = None, 0
     for group in groups:
@@ -225,8 +225,10 @@ def concatenated(groups: Iterable[Any], *, count: int) -> Any:
 
 def _zeros(rows: int, like: jax.Array) -> np.ndarray | jax.Array:
     zeros = np.zeros((rows, *like.shape[1:]), like.dtype)
-    # An array that is bound to a device where others are not would be another program's.
-    return jax.device_put(zeros, like.sharding) if like.committed else zeros
+    if not like.committed:  # bound to a device, they would be arguments of another program
+        return zeros
+    # A transfer to the devices of several processes would compare their values first.
+    return jax.make_array_from_callback(zeros.shape, like.sharding, lambda index: zeros[index])
 
 
 @functools.partial(jax.jit, donate_argnums=0)
