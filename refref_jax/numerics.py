@@ -47,9 +47,10 @@ def safe_divide(
     """Returns `numerator / denominator`, and 0 with zero gradients where the denominator is 0.
 
     The gradient is computed from the quotient instead of the squared denominator, so it is finite
-    even for denominators whose square underflows.
+    even for denominators whose square underflows. Subnormal denominators count as 0 on all devices,
+    as they do on a CPU: on a GPU, their reciprocals would be infinite.
     """
-    nonzero = denominator != 0
+    nonzero = jnp.abs(denominator) >= jnp.finfo(denominator.dtype).tiny
     return jnp.where(nonzero, numerator / jnp.where(nonzero, denominator, 1.0), 0.0)
 
 

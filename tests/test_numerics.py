@@ -83,7 +83,7 @@ def test_safe_divide_over_all_magnitudes():
 
 
 @pytest.mark.parametrize("numerator", [0.0, 1.0, -1e30, np.inf])
-@pytest.mark.parametrize("denominator", [0.0, -0.0])
+@pytest.mark.parametrize("denominator", [0.0, -0.0, 1e-40, -1e-45])
 def test_safe_divide_by_zero_is_zero_with_zero_gradients(numerator, denominator):
     arguments = np.float32(numerator), np.float32(denominator)
     assert _safe_divide(*map(jnp.asarray, arguments)) == 0.0

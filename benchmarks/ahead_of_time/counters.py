@@ -174,6 +174,16 @@ def launches(found: list[Kernel], depth: int) -> int:
     return max(each.values(), default=0)
 
 
+def gathers_in_branches(program: Program) -> int:
+    """Returns the most gathers of a fusion that also concatenates.
+
+    Neighbouring threads of such a kernel compute different parts of its result, so that each of
+    them waits for the gathers of all.
+    """
+    found = [[line.opcode for line in lines] for lines in program.computations.values()]
+    return max((each.count("gather") for each in found if "concatenate" in each), default=0)
+
+
 def part_of_step(kernel: Kernel) -> str:
     """Returns which part of a training step a kernel belongs to."""
     if len(kernel.loops) != 1:

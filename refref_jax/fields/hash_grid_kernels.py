@@ -180,10 +180,15 @@ def _gathered(
     resolution: int,
     precision: Precision,
 ) -> Float[Array, "*batch features"]:
-    entries, weights = _stacked_corners(positions, resolution, table.shape[0])
-    # Converting the table would read and write all of it.
-    rows = _rounded(table.at[entries].get(mode="promise_in_bounds"), precision)
-    return jnp.einsum("...c,...cf->...f", weights, rows, precision=jax.lax.Precision.HIGHEST)
+    # Two barriers: without the first, XLA stores cells and weights of all points and levels;
+    # without the second, it computes all levels in one kernel, in which each feature is a branch.
+    axes = jax.lax.optimization_barrier([positions[..., axis] for axis in range(3)])
+    blended = jnp.zeros((*positions.shape[:-1], table.shape[1]), table.dtype)
+    for entries, weights in corners(axes, resolution, table.shape[0]):
+        # Converting the table would read and write all of it.
+        rows = _rounded(table.at[entries].get(mode="promise_in_bounds"), precision)
+        blended += weights[..., None] * rows
+    return jax.lax.optimization_barrier(blended)
 
 
 def _scattered(
