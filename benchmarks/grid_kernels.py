@@ -4,8 +4,7 @@
 
 Times the mean features of multisamples along random chords, for the hash grids of presets, by the
 library and by other ways to write the same sums. `branches` is what XLA makes of the shortest one:
-a kernel that computes all levels, in which each feature is a branch. The claim is about GPUs: on a
-CPU the library runs native loops, and nothing is asserted.
+a kernel that computes all levels, in which each feature is a branch. Nothing is asserted on a CPU.
 """
 
 import functools

@@ -4,14 +4,12 @@ A grid of `n` cells per side covers the unit cube. If its `(n + 1)^3` vertices f
 each vertex has its own row, with x varying fastest; otherwise, vertices are hashed to rows.
 
 This part of a field is memory-bound: every point reads eight rows at random addresses, and adds to
-eight rows in the backward pass. Both operations are custom primitives, because XLA's loops for them
-on a CPU take about twice as long as one loop over points that computes the rows once and keeps them
-in registers for all features of a point. CPUs run these native loops, `gather` and `scatter`; other
-devices use the formulas `_gathered` and `_scattered`, as do rare operations (derivatives with
-respect to the position, several tables at once). The results are the same.
+eight rows in the backward pass. Both operations are custom primitives with leading axes, which
+`vmap` adds: all points of a batch are one loop, or one gather.
 
-Both primitives take leading axes, which `vmap` adds: all points of a batch are one loop, or one
-gather.
+The formulas `_gathered` and `_scattered` are for all devices, but XLA adds to rows on a CPU in a
+loop that takes twice as long as one over points that computes the rows once. CPUs run that native
+loop, `scatter`, instead; its result is the same.
 
 Source: Mueller et al., Instant NGP (2022), section 3.
 """
@@ -83,31 +81,6 @@ def _entry(
     x, y, z = terms
     # Parenthesised so that the term of two axes is computed once for two corners.
     return (x ^ (y ^ z)) & jnp.uint32(entries - 1) if strides is _PRIMES else x + (y + z)
-
-
-def gather(
-    table: Float[Array, "entries features"],
-    positions: Float[Array, "*batch 3"],
-    *,
-    resolution: int,
-    precision: Precision,
-) -> Float[Array, "*batch features"]:
-    """Blends the rows at the eight corners of each point's cell; see `interpolate`."""
-    features = table.shape[1]
-
-    @native_loop
-    def blend_all(table: Array, points: Array) -> Array:
-        def blend(index: Array, blended: Array) -> Array:
-            index = index.astype(jnp.uint32)
-            total = jnp.zeros((1, features), table.dtype)
-            for entry, weight in corners(list(_row(points, index)[0]), resolution, table.shape[0]):
-                total += weight * _rounded(_row(table, entry), precision)
-            return _with_row(blended, index, total)
-
-        start = jnp.zeros((points.shape[0], features), table.dtype)
-        return jax.lax.fori_loop(0, points.shape[0], blend, start)
-
-    return blend_all(table, positions.reshape(-1, 3)).reshape(*positions.shape[:-1], features)
 
 
 def scatter(
@@ -219,8 +192,14 @@ def _stacked_corners(
 # Primitives: both are linear in their first argument, and each is the other's transpose.
 
 
-def _primitive(name: str, formula: Callable[..., Array], loop: Callable[..., Array]) -> Primitive:
-    """Returns a primitive over `(values, positions)`, without batching or derivative rules."""
+def _primitive(name: str, formula: Callable[..., Array], *, cpu: Callable[..., Array]) -> Primitive:
+    """Returns a primitive over `(values, positions)`, without batching or derivative rules.
+
+    Args:
+      name: name of the operation in printed programs.
+      formula: what it computes.
+      cpu: the same for CPUs.
+    """
     primitive = Primitive(name)
 
     def abstract(*arguments: Any, **options: Any) -> jax.core.ShapedArray:
@@ -230,7 +209,7 @@ def _primitive(name: str, formula: Callable[..., Array], loop: Callable[..., Arr
     primitive.def_impl(functools.partial(_evaluate, formula))
     primitive.def_abstract_eval(abstract)
     mlir.register_lowering(primitive, mlir.lower_fun(formula, multiple_results=False))
-    mlir.register_lowering(primitive, mlir.lower_fun(loop, multiple_results=False), platform="cpu")
+    mlir.register_lowering(primitive, mlir.lower_fun(cpu, multiple_results=False), platform="cpu")
     return primitive
 
 
@@ -307,12 +286,12 @@ def _transpose_scatter(
     return _gather.bind(table, positions, resolution=resolution, precision="float32"), None
 
 
-_gather = _primitive("gather_vertices", _gathered, gather)
+_gather = _primitive("gather_vertices", _gathered, cpu=_gathered)
 batching.primitive_batchers[_gather] = _map_gather
 ad.defjvp(_gather, _derive_gather, functools.partial(_derive_by_positions, _gathered))
 ad.primitive_transposes[_gather] = _transpose_gather
 
-_scatter = _primitive("scatter_vertices", _scattered, scatter)
+_scatter = _primitive("scatter_vertices", _scattered, cpu=scatter)
 batching.primitive_batchers[_scatter] = functools.partial(_map, _scattered)
 ad.defjvp(_scatter, _derive_scatter, functools.partial(_derive_by_positions, _scattered))
 ad.primitive_transposes[_scatter] = _transpose_scatter
