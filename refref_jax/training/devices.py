@@ -40,6 +40,9 @@ def connect(*, coordinator: str, processes: int, process: int) -> None:
     Raises:
       ValueError: if the processes cannot connect.
     """
+    # Programs that do not depend on each other would run at once, and their sums over processes
+    # would mix: Gloo has one channel.
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
     try:
         jax.distributed.initialize(
             coordinator,
