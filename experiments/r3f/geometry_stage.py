@@ -111,7 +111,10 @@ def run(
     refused = [f"{stage.name}: {stage.refused}" for stage in refined if stage.refused]
     if families:
         try:
-            chosen = shape_from_outlines(mesh, trusted, carved=befores[1], seed=config.seed)
+            with ProgressBar("families", 1) as bar:
+                chosen = shape_from_outlines(
+                    mesh, trusted, carved=befores[1], seed=config.seed, progress=bar.move
+                )
         except ReconstructionError as error:
             refused.append(f"families of shapes: {error}")
         mesh = mesh if chosen is None else chosen.mesh

@@ -11,7 +11,7 @@ family that lacks a part which the masks show, such as a handle, is rejected.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
@@ -239,7 +239,12 @@ class FamilyFit(NamedTuple):
 
 
 def shape_from_outlines(
-    mesh: Mesh, views: Views, *, carved: Mesh | None = None, seed: int = 0
+    mesh: Mesh,
+    views: Views,
+    *,
+    carved: Mesh | None = None,
+    seed: int = 0,
+    progress: Callable[[int, int, str], None] = lambda done, total, text: None,
 ) -> FamilyFit | None:
     """Returns the smallest family of shapes that the outlines of masks do not reject.
 
@@ -253,6 +258,7 @@ def shape_from_outlines(
       views: these masks and their cameras.
       carved: the mesh before it was smoothed, which rounds its corners.
       seed: seed of the draws of points.
+      progress: called with the number of fits that are done, their total, and a line of text.
 
     Returns:
       `None` if the mesh is better than any family, if it has several pieces, or if there are too
@@ -271,16 +277,20 @@ def shape_from_outlines(
         return None
     whole = _judged_by_masks(FixedShape(mesh), mesh, judges)
     allowed = min(_MOST_APART, _APART_SHARE * whole.apart + _APART_MORE)
-    trials = [whole]
-    for shape in _near_outlines(carved, fitted):
+    trials, shapes = [whole], _near_outlines(carved, fitted)
+    total = len(shapes) + 1
+    for number, shape in enumerate(shapes):
+        progress(number, total, shape.name)
         found = mesh_of(shape.pose(fit_to_outlines(shape, fitted, seed=seed)))
         trial = _judged_by_masks(shape, found, judges)
         trials += [trial] if trial.apart <= allowed else []
     most = _AS_GOOD * min(each.by_view.mean() for each in trials)  # few views cannot tell
     chosen = choose([each for each in trials if each.by_view.mean() <= most], level=0.0)
     if chosen is whole:
+        progress(total, total, "no family is as good as the mesh")
         return None
     x = fit_to_outlines(chosen.shape, views, seed=seed)
+    progress(total, total, chosen.shape.name)
     return FamilyFit(chosen.shape.name, mesh_of(chosen.shape.pose(x)))
 
 

@@ -58,8 +58,12 @@ def test_a_small_ball_on_a_table_is_a_sphere(monkeypatch):
     monkeypatch.setattr(model_selection.families, "candidates", near)
     monkeypatch.setattr(model_selection, "_TOLERANCES", (4.0,))
     views = _views_from_above(_ball, pixels=0.7, size=64)
-    found = model_selection.shape_from_outlines(_carved(views, resolution=24), views)
+    told = []
+    found = model_selection.shape_from_outlines(
+        _carved(views, resolution=24), views, progress=lambda *x: told.append(x)
+    )
     assert found is not None and found.name == "sphere"
+    assert told[0][0] == 0 and told[-1] == (len(told), len(told), "sphere")
     away = np.linalg.norm(found.mesh.vertices - _CENTRE, axis=-1)
     assert away == pytest.approx(_RADIUS, rel=0.02)
 
