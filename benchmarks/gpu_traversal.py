@@ -25,8 +25,8 @@ from refref_jax.geometry import bvh, bvh_build, traversal
 _RAYS = flags.DEFINE_list("rays", [str(1 << n) for n in (12, 17, 20)], "Numbers of rays to cast.")
 _ANY_SPEED = flags.DEFINE_bool("any_speed", False, "Assert nothing about the speed.")
 
-# Largest share of rays with another triangle, which one of a few rays may exceed, and largest
-# relative difference of a distance.
+# Largest share of rays with another triangle (a single ray is always allowed), and largest relative
+# difference of a distance.
 _MOST_HITS, _MOST_DISTANCE = 1e-4, 1e-4
 
 _MESHES = {

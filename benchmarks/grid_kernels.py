@@ -4,7 +4,8 @@
 
 Times the mean features of multisamples along random chords, for the hash grids of presets, by the
 library and by other ways to write the same sums. `branches` is what XLA makes of the shortest one:
-a kernel that computes all levels, in which each feature is a branch. Nothing is asserted on a CPU.
+a kernel that fuses the concatenation of levels, so that each level is a branch. Nothing is asserted
+on a CPU.
 """
 
 import functools
@@ -64,7 +65,7 @@ def _library(table: jax.Array, positions: jax.Array, resolution: int) -> jax.Arr
 
 _WAYS: dict[str, Callable[..., jax.Array]] = {
     "branches": _stacked,
-    "branches, levels apart": lambda *x: _barrier(_stacked(*x)),
+    "product, levels apart": lambda *x: _barrier(_stacked(*x)),
     "corners in turn, levels apart": lambda *x: _barrier(_unrolled(*x)),
     "library": _library,
 }
@@ -81,7 +82,7 @@ def main(arguments: list[str]) -> None:
             values = jax.device_put(_values(_CASES[name]))
             found[way] = features(*values)
             taken[way] = best_of(functools.partial(features, *values))
-            print(f"{name},{way},{1e3 * taken[way]:.3f}", flush=True)
+            print(f'{name},"{way}",{1e3 * taken[way]:.3f}', flush=True)
             np.testing.assert_allclose(found[way], found["branches"], atol=1e-5)
         slow += [name] if taken["library"] > 0.5 * taken["branches"] else []
     claimed = jax.default_backend() == "gpu" and not _ANY_SPEED.value

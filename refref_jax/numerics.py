@@ -48,9 +48,9 @@ def safe_divide(
 
     The gradient is computed from the quotient instead of the squared denominator, so it is finite
     even for denominators whose square underflows. Subnormal denominators count as 0 on all devices,
-    as they do on a CPU: on a GPU, their reciprocals would be infinite.
+    as those of single precision do on a CPU: on a GPU, their reciprocals would be infinite.
     """
-    nonzero = jnp.abs(denominator) >= jnp.finfo(denominator.dtype).tiny
+    nonzero = ~(jnp.abs(denominator) < jnp.finfo(denominator.dtype).tiny)
     return jnp.where(nonzero, numerator / jnp.where(nonzero, denominator, 1.0), 0.0)
 
 

@@ -90,6 +90,13 @@ def test_safe_divide_by_zero_is_zero_with_zero_gradients(numerator, denominator)
     assert _gradient(numerics.safe_divide, *arguments) == (0.0, 0.0)
 
 
+def test_safe_divide_hides_no_nan():
+    nan = np.float32(np.nan)
+    assert np.isnan(_safe_divide(jnp.ones(()), jnp.asarray(nan)))
+    assert np.isnan(_safe_divide(jnp.asarray(nan), jnp.ones(())))
+    assert np.isnan(_gradient(numerics.safe_divide, np.float32(1.0), nan)).all()
+
+
 @pytest.mark.parametrize("magnitude", [1e-35, 1e-25, 1e-18, 1.0, 1e18, 1e25, 1e35])
 def test_safe_divide_gradient_is_finite_where_the_square_is_not_representable(magnitude):
     size = np.float32(magnitude)

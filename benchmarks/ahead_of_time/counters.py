@@ -175,13 +175,25 @@ def launches(found: list[Kernel], depth: int) -> int:
 
 
 def gathers_in_branches(program: Program) -> int:
-    """Returns the most gathers of a fusion that also concatenates.
+    """Returns the most gathers that lead to a concatenation within one kernel.
 
-    Neighbouring threads of such a kernel compute different parts of its result, so that each of
-    them waits for the gathers of all.
+    Neighbouring threads of such a kernel compute different parts of its result, and wait for each
+    other's gathers.
     """
-    found = [[line.opcode for line in lines] for lines in program.computations.values()]
-    return max((each.count("gather") for each in found if "concatenate" in each), default=0)
+    bodies = program.computations
+    launched = {called for lines in bodies.values() for line in lines for called in line.calls}
+    fused = bodies.keys() - launched - {program.entry}
+    return max((_gathers_below(bodies[name]) for name in fused), default=0)
+
+
+def _gathers_below(lines: tuple[Instruction, ...]) -> int:
+    """Returns the most gathers that a concatenation among some instructions depends on."""
+    most, gathers = 0, dict[str, set[str]]()
+    for line in lines:
+        below = set[str]().union(*(gathers.get(operand, set()) for operand in line.operands))
+        most = max(most, len(below)) if line.opcode == "concatenate" else most
+        gathers[line.name] = below | {line.name} if line.opcode == "gather" else below
+    return most
 
 
 def part_of_step(kernel: Kernel) -> str:

@@ -7,9 +7,9 @@ This part of a field is memory-bound: every point reads eight rows at random add
 eight rows in the backward pass. Both operations are custom primitives with leading axes, which
 `vmap` adds: all points of a batch are one loop, or one gather.
 
-The formulas `_gathered` and `_scattered` are for all devices, but XLA adds to rows on a CPU in a
-loop that takes twice as long as one over points that computes the rows once. CPUs run that native
-loop, `scatter`, instead; its result is the same.
+The formulas `_gathered` and `_scattered` are for all devices. On a CPU, XLA's own loop for adding
+to rows takes twice as long as one over points that finds each point's rows once, so CPUs run that
+native loop, `scatter`; its result is the same.
 
 Source: Mueller et al., Instant NGP (2022), section 3.
 """
@@ -153,8 +153,9 @@ def _gathered(
     resolution: int,
     precision: Precision,
 ) -> Float[Array, "*batch features"]:
-    # Two barriers: without the first, XLA stores cells and weights of all points and levels;
-    # without the second, it computes all levels in one kernel, in which each feature is a branch.
+    # Two barriers: without the first, XLA stores the place of each point in its cell, for all
+    # levels; without the second, it fuses the concatenation of levels, and neighbouring threads
+    # branch.
     axes = jax.lax.optimization_barrier([positions[..., axis] for axis in range(3)])
     blended = jnp.zeros((*positions.shape[:-1], table.shape[1]), table.dtype)
     for entries, weights in corners(axes, resolution, table.shape[0]):
@@ -192,13 +193,15 @@ def _stacked_corners(
 # Primitives: both are linear in their first argument, and each is the other's transpose.
 
 
-def _primitive(name: str, formula: Callable[..., Array], *, cpu: Callable[..., Array]) -> Primitive:
+def _primitive(
+    name: str, formula: Callable[..., Array], *, cpu: Callable[..., Array] | None = None
+) -> Primitive:
     """Returns a primitive over `(values, positions)`, without batching or derivative rules.
 
     Args:
       name: name of the operation in printed programs.
       formula: what it computes.
-      cpu: the same for CPUs.
+      cpu: the same for CPUs, if they have one of their own.
     """
     primitive = Primitive(name)
 
@@ -209,7 +212,9 @@ def _primitive(name: str, formula: Callable[..., Array], *, cpu: Callable[..., A
     primitive.def_impl(functools.partial(_evaluate, formula))
     primitive.def_abstract_eval(abstract)
     mlir.register_lowering(primitive, mlir.lower_fun(formula, multiple_results=False))
-    mlir.register_lowering(primitive, mlir.lower_fun(cpu, multiple_results=False), platform="cpu")
+    if cpu is not None:
+        own = mlir.lower_fun(cpu, multiple_results=False)
+        mlir.register_lowering(primitive, own, platform="cpu")
     return primitive
 
 
@@ -286,7 +291,7 @@ def _transpose_scatter(
     return _gather.bind(table, positions, resolution=resolution, precision="float32"), None
 
 
-_gather = _primitive("gather_vertices", _gathered, cpu=_gathered)
+_gather = _primitive("gather_vertices", _gathered)
 batching.primitive_batchers[_gather] = _map_gather
 ad.defjvp(_gather, _derive_gather, functools.partial(_derive_by_positions, _gathered))
 ad.primitive_transposes[_gather] = _transpose_gather

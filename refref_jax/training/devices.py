@@ -32,6 +32,8 @@ _LEAST_BYTES = 200
 def connect(*, coordinator: str, processes: int, process: int) -> None:
     """Connects this process to others that train together; must be called before devices are used.
 
+    From then on, programs for CPUs run one after the other in this process, even if it fails.
+
     Args:
       coordinator: address at which the first process listens, as `host:port`.
       processes: number of processes.
