@@ -84,13 +84,8 @@ def test_kinds_of_field_that_are_not_trained_cost_nothing(monkeypatch):
     model, config = MODEL, small_model.CONFIG
     state = jax.eval_shape(lambda: loop.init_state(0, model, config.schedule))
     batches = jax.tree.map(lambda x: x[None, :32], _RAYS)
-    traced = jax.eval_shape(
-        functools.partial(
-            loop.pretrace, settings=TREE, capacity=256, detail=path_detail(model, TREE)
-        ),
-        scenes.build(_BALL),
-        batches,
-    )
+    options = {"settings": TREE, "capacity": 256, "detail": path_detail(model, TREE)}
+    traced = loop.pretrace.eval_shape(scenes.build(_BALL), batches, **options)
     number = jax.ShapeDtypeStruct((), jnp.int32)
     pretraced = loop.PretracedBatches(
         traced,
