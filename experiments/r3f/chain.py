@@ -44,7 +44,7 @@ def reconstruct(
       out: folder of the reconstruction, see `records`.
       config: options of the reconstruction.
       compare: whether the report may read the scene's own meshes.
-      say: called with a line of text for every stage.
+      say: function called with a line of text for every stage.
 
     Raises:
       ValueError: if the scene lacks required files, if the packages for extracting surfaces are not

@@ -46,7 +46,7 @@ def asked(options: Options, *, say: config_flags.Say) -> TrainConfig:
 
     Args:
       options: flags of the configuration, by name.
-      say: called with the decisions of --config that are made again.
+      say: function called with the decisions of --config that are made again.
 
     Raises:
       ValueError: if the configuration is invalid.
@@ -213,7 +213,7 @@ def with_parts(
       parts: parts of the reconstructed object.
       made: folder of its reconstruction.
       ior: values of --ior.
-      say: called with the decisions that are made again.
+      say: function called with the decisions that are made again.
     """
     folder = str(made.resolve())
     index = tuple((part.name, part.index) for part in parts)

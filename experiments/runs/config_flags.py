@@ -101,7 +101,7 @@ def chosen(holders: Mapping[str, flags.FlagHolder], *, say: Say, **instead: Any)
 
     Args:
       holders: flags that `define_flags` returned.
-      say: called with the decisions of the file that are made again.
+      say: function called with the decisions of the file that are made again.
       **instead: values that replace those of flags.
 
     Raises:
@@ -122,7 +122,7 @@ def on_top(below: TrainConfig, values: Mapping[str, Any], *, say: Say) -> TrainC
     Args:
       below: configuration to override, from `--config` if that is set.
       values: new values, by the names of the options.
-      say: called with lines of text.
+      say: function called with lines of text.
     """
     config, (decided, kept) = below.override(**values), below.followers(**values)
     options = [option.name for option in training_config.options_of()]

@@ -200,8 +200,8 @@ def _primitive(
 
     Args:
       name: name of the operation in printed programs.
-      formula: what it computes.
-      cpu: the same for CPUs, if they have one of their own.
+      formula: function that it computes.
+      cpu: function for CPUs, if they have one of their own.
     """
     primitive = Primitive(name)
 

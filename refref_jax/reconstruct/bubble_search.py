@@ -126,7 +126,7 @@ def find_bubbles(
       settings: settings of the search.
       outlines: equations of the masks' outlines, for the last steps.
       seed: seed of the draws.
-      progress: called with the share of the work that is done, and a line of text.
+      progress: function called with the share of the work that is done, and a line of text.
 
     Returns:
       The object with its bubbles, or the trial itself if none was found.

@@ -164,7 +164,7 @@ def fit_free_vessel(
       glass_deviation: standard deviation of its prior; 0 keeps it.
       outlines: equations of the masks' outlines.
       seed: seed of the draws.
-      progress: called with the share of the work that is done, and a line of text.
+      progress: function called with the share of the work that is done, and a line of text.
 
     Returns:
       The better of both contents; `None` if no wall leaves space inside, or the walls cross.

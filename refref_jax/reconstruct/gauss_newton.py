@@ -240,7 +240,7 @@ def fit(
       pixels: all pixels that may be drawn, none of which may judge the result.
       settings: settings of the fit.
       outlines: further equations at a candidate.
-      progress: called with the number of steps, and what the last one did.
+      progress: function called with the number of steps, and what the last one did.
 
     Raises:
       ReconstructionError: if there are no pixels.

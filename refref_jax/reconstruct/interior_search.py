@@ -170,7 +170,7 @@ def search(
       detail: resolution of the meshes of the last fit.
       outlines: equations of the masks' outlines, for that fit.
       looks: looks at all hypotheses, if there are any yet (`looks_at_all`).
-      progress: called with a line about each fit.
+      progress: function called with a line about each fit.
 
     Raises:
       ReconstructionError: if there are no pixels, the object is a ring, or no wall fits into it.

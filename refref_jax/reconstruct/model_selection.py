@@ -258,7 +258,7 @@ def shape_from_outlines(
       views: these masks and their cameras.
       carved: the mesh before it was smoothed, which rounds its corners.
       seed: seed of the draws of points.
-      progress: called with the number of fits that are done, their total, and a line of text.
+      progress: function called with the number of fits done, their total, and a line of text.
 
     Returns:
       `None` if the mesh is better than any family, if it has several pieces, or if there are too

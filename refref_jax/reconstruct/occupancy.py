@@ -331,7 +331,7 @@ def fit(
         grids.
       resolution: cells along the longest edge of the box.
       box: bounding box of the object; that of `search_box` if `None`.
-      progress: called every hundred steps and at the end.
+      progress: function called every hundred steps and at the end.
 
     Raises:
       ReconstructionError: if there is no mask, if a mask is empty or of another size, if no ray

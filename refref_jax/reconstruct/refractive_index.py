@@ -239,7 +239,7 @@ def estimate_index(
       config: configuration of the field's model.
       search: settings of the search.
       start: index that the user expects, from which a descent always starts.
-      progress: called with the number of evaluations done, and the largest possible number.
+      progress: function called with the number of evaluations done, and the most there can be.
 
     Raises:
       ReconstructionError: if there are no pixels, or no error is finite.

@@ -190,7 +190,7 @@ def find_index(
       pixels: pixels that see the object.
       search: ladder, and number of rungs from which to begin.
       start: index that the user expects, from which steps begin, too.
-      progress: called with the number of looks and steps done, and their number.
+      progress: function called with the number of looks and steps done, and their number.
       seed: seed of the draws.
 
     Raises:
@@ -297,8 +297,8 @@ def fit_shapes(
       deviation: standard deviation of the index; 0 keeps it.
       outlines: equations of the masks' outlines.
       seed: seed of the draws.
-      is_enough: called with the trials before the free surface, which is left out if it is true.
-      progress: called with the share of the work that is done, and a line of text.
+      is_enough: function of the trials before the free surface, which is left out if it is true.
+      progress: function called with the share of the work that is done, and a line of text.
     """
     task = _Task(surface, pixels, judges, outlines, deviation, seed)
     fixed = SingleObject(FixedShape(mesh), index, deviation=deviation)
@@ -419,7 +419,7 @@ def fit_free_surface(
       deviation: standard deviation of the index; 0 keeps it.
       outlines: equations of the masks' outlines.
       seed: seed of the draws.
-      progress: called with the number of steps, and what the last one did.
+      progress: function called with the number of steps, and what the last one did.
     """
     task = _Task(surface, pixels, judges, outlines, deviation, seed)
     mesh, done = _with_many_vertices(mesh), 0
