@@ -220,7 +220,9 @@ def render_known_camera(
     places few. The first rays keep the weight that their number gives them. One that is not bent
     costs a thirtieth of the others: pixels beside the objects have at least four first rays, and
     where a refined pixel shows the background past the objects, up to four times as many rays
-    measure it and its share of the pixel, and replace the first ones.
+    measure it and its share of the pixel, and replace the first ones. Half of those that meet an
+    object are bent, too. All this is everything that is added where `refined_rays_per_pixel` is
+    `rays_per_pixel`.
 
     Args:
       scene: the scene.
@@ -229,16 +231,16 @@ def render_known_camera(
       view: index of the camera.
       settings: path settings.
       rays_per_pixel: number of rays in each pixel, a square: 1, 4, 9, 16.
-      refined_rays_per_pixel: number of rays in the pixels above the tolerance, a larger square;
-        every pixel has `rays_per_pixel` by default.
+      refined_rays_per_pixel: number of rays in the pixels above the tolerance, a square that is not
+        smaller; every pixel has `rays_per_pixel` by default, the background, too.
       tolerance: difference between the largest and the smallest sRGB value in `[0, 1]` of
         neighbouring rays, in the worst channel, up to which a pixel is not refined.
       interior_list: interior list of the camera's position, see `render_known`.
       tile: number of rays traced at once, see `render_known`.
 
     Raises:
-      ValueError: if a number of rays is not a square, the refined number is not larger, the
-        tolerance is negative, or `render_known` rejects its arguments.
+      ValueError: if a number of rays is not a square, the refined number is smaller, the tolerance
+        is negative, or `render_known` rejects its arguments.
       TypeError: if it is called in a function that JAX transforms.
 
     Example:
@@ -259,10 +261,11 @@ def render_known_camera(
     scene, radiance = jax.device_put((scene, _as_argument(radiance)))
     camera = _Camera(scene, radiance, cameras, view, settings, interior_list, tile)
     refines = refined_rays_per_pixel is not None
-    image, rays = _first_image(camera, rays_per_pixel, _FEWEST_BESIDE if refines else 1)
+    image, first = _first_image(camera, rays_per_pixel, _FEWEST_BESIDE if refines else 1)
     if refined_rays_per_pixel is not None:
-        again = np.nonzero(_contrast(rays) > tolerance)
-        image = _refined(camera, image, again, refined_rays_per_pixel)
+        again = np.nonzero(_contrast(first.rgb) > tolerance)
+        many = refined_rays_per_pixel if refined_rays_per_pixel > rays_per_pixel else None
+        image = _refined(camera, image, first, again, many)
     rgb = np.clip(np.asarray(pixels.linear_to_srgb(jax.device_put(image.linear))), 0.0, 1.0)
     return image._replace(rgb=rgb)
 
@@ -279,11 +282,24 @@ def _check_refinement(count: int, refined: int | None, tolerance: float) -> None
             side_of(number)
     if not tolerance >= 0.0:
         raise ValueError(f"tolerance is {tolerance}. Give 0 or more.")
-    if refined is not None and not count < refined:
+    if refined is not None and not count <= refined:
         raise ValueError(
-            f"refined_rays_per_pixel is {refined}, not more than rays_per_pixel, {count}. Give a "
+            f"refined_rays_per_pixel is {refined}, less than rays_per_pixel, {count}. Give a "
             "larger square, or None."
         )
+
+
+class _PixelRays(NamedTuple):
+    """The rays of pixels, some repeated where a pixel has fewer; fields as in `KnownRendering`.
+
+    Attributes:
+      met: whether a ray meets an object.
+    """
+
+    rgb: Float[np.ndarray, "*pixels rays 3"]
+    linear: Float[np.ndarray, "*pixels rays 3"]
+    dropped: Float[np.ndarray, "*pixels rays 3"]
+    met: Bool[np.ndarray, "*pixels rays"]
 
 
 class _Camera(NamedTuple):
@@ -301,20 +317,17 @@ class _Camera(NamedTuple):
         """Returns a number of rays of each pixel, along the last axis."""
         return pinholes.rays_of_pixels(self.cameras, self.view, row, column, side=side_of(count))
 
-    def render(
-        self, row: np.ndarray, column: np.ndarray, count: int
-    ) -> tuple[KnownRendering, Bool[np.ndarray, "*pixels rays"]]:
-        """Returns the rendering of these rays, and which meet an object."""
+    def render(self, row: np.ndarray, column: np.ndarray, count: int) -> tuple[_PixelRays, int]:
+        """Returns these rays, rendered, and the number of casts."""
         rays, listed = self.rays(row, column, count), self.interior_list
         if listed is not None:
             listed = np.broadcast_to(listed, (*rays.radii.shape, *listed.shape))
-        return _render(self.scene, self.radiance, rays, self.settings, listed, self.tile)
+        seen, met = _render(self.scene, self.radiance, rays, self.settings, listed, self.tile)
+        return _PixelRays(seen.rgb, seen.linear, seen.dropped, met), seen.casts
 
 
-def _first_image(
-    camera: _Camera, count: int, fewest: int
-) -> tuple[KnownImage, Float[np.ndarray, "h w rays 3"]]:
-    """Returns an image that is not encoded yet, and the colours of its rays.
+def _first_image(camera: _Camera, count: int, fewest: int) -> tuple[KnownImage, _PixelRays]:
+    """Returns an image that is not encoded yet, and its rays.
 
     Args:
       camera: what is rendered.
@@ -323,46 +336,55 @@ def _first_image(
         rays of other pixels are repeated.
     """
     row, column = np.indices((camera.cameras.height, camera.cameras.width))
-    seen, met = camera.render(row, column, count)
-    rgb, linear, dropped = seen.rgb, seen.linear.mean(axis=2), seen.dropped.mean(axis=2)
-    casts, rays = seen.casts, np.full(row.shape, count, np.int32)
+    first, casts = camera.render(row, column, count)
+    rays = np.full(row.shape, count, np.int32)
     if count < fewest:  # a square below four: one
-        beside = ~met.any(axis=2)
-        finer, _ = camera.render(row[beside], column[beside], fewest)
-        casts, rays[beside] = casts + finer.casts, fewest
-        linear[beside], dropped[beside] = finer.linear.mean(axis=1), finer.dropped.mean(axis=1)
-        rgb = np.repeat(rgb, fewest, axis=2)
-        rgb[beside] = finer.rgb
-    return KnownImage(linear, linear, rays, dropped, casts), rgb
+        beside = ~first.met.any(axis=2)
+        finer, more = camera.render(row[beside], column[beside], fewest)
+        casts, rays[beside] = casts + more, fewest
+        first = _PixelRays(*(np.repeat(x, fewest, axis=2) for x in first))
+        for values, better in zip(first, finer, strict=True):
+            values[beside] = better
+    linear, dropped = first.linear.mean(axis=2), first.dropped.mean(axis=2)
+    return KnownImage(linear, linear, rays, dropped, casts), first
 
 
 def _refined(
-    camera: _Camera, image: KnownImage, again: tuple[np.ndarray, ...], many: int
+    camera: _Camera,
+    image: KnownImage,
+    first: _PixelRays,
+    again: tuple[np.ndarray, ...],
+    many: int | None,
 ) -> KnownImage:
-    """Renders pixels again with many rays; the arrays of the image change.
+    """Refines pixels; the arrays of the image change.
 
     Args:
       camera: what is rendered.
       image: image of few rays in each pixel.
+      first: its rays.
       again: rows and columns of the pixels.
-      many: number of rays in each pixel that is rendered again.
+      many: number of rays in each pixel that is rendered again; with None, only the background
+        gets more.
     """
-    straight = max(many, min(4 * many, _MOST_STRAIGHT))
+    few = many or first.met.shape[2]
+    straight = max(few, min(4 * few, _MOST_STRAIGHT))
     band, casts = max(1, images.RAYS_OF_A_BAND // straight), image.casts
     for start in range(0, again[0].size, band):
         here = again[0][start : start + band], again[1][start : start + band]
-        finer, met = camera.render(*here, many)
-        share = 1.0 / (1.0 + (image.rays[here] / many) ** _ERROR_FALLS)[:, None]
-        for values, more in (image.linear, finer.linear), (image.dropped, finer.dropped):
-            values[here] = (1.0 - share) * values[here] + share * more.mean(axis=1)
-        image.rays[here] += many
-        beside = ~met.all(axis=1) & (straight > many)
+        known = _PixelRays(*(x[here] for x in first))
+        if many is not None:
+            known, more = camera.render(*here, many)
+            share = 1.0 / (1.0 + (image.rays[here] / many) ** _ERROR_FALLS)[:, None]
+            for values, finer in (image.linear, known.linear), (image.dropped, known.dropped):
+                values[here] = (1.0 - share) * values[here] + share * finer.mean(axis=1)
+            image.rays[here] += many
+            casts += more
+        beside = ~known.met.all(axis=1) & (straight > few)
         here = here[0][beside], here[1][beside]
-        known = finer.linear[beside], finer.dropped[beside], met[beside]
-        rays = camera.rays(*here, straight)
-        image.linear[here], image.dropped[here] = _with_more_background(camera, rays, *known)
+        known, rays = _PixelRays(*(x[beside] for x in known)), camera.rays(*here, straight)
+        image.linear[here], image.dropped[here], more = _with_more_background(camera, rays, known)
         image.rays[here] = straight
-        casts += finer.casts + rays.radii.size * (camera.settings.max_bends > 0)
+        casts += more
     return image._replace(casts=casts)
 
 
@@ -382,30 +404,33 @@ def _contrast(rgb: Float[np.ndarray, "h w rays 3"]) -> Float[np.ndarray, "h w"]:
 
 
 def _with_more_background(
-    camera: _Camera,
-    rays: Rays,
-    linear: Float[np.ndarray, "pixels few 3"],
-    dropped: Float[np.ndarray, "pixels few 3"],
-    met: Bool[np.ndarray, "pixels few"],
-) -> tuple[Float[np.ndarray, "pixels 3"], Float[np.ndarray, "pixels 3"]]:
-    """Returns mean colours and dropped throughput over many rays, of which straight are rendered.
+    camera: _Camera, rays: Rays, known: _PixelRays
+) -> tuple[Float[np.ndarray, "pixels 3"], Float[np.ndarray, "pixels 3"], int]:
+    """Returns mean colours and dropped throughput over many rays, and the number of casts.
 
-    Those of few rays are known, and which `met` an object. One of many that meets an object counts
-    as the mean of the few that did in its pixel, and as straight where none did.
+    Few rays of each pixel are known, and many rendered as straight ones. Those of many that meet an
+    object count as straight where none of the few did. Elsewhere every second one is bent, as on a
+    checkerboard, and all count as the mean of these and of the few that did in their pixel.
 
     Source: double sampling for stratification; Neyman, Contribution to the Theory of Sampling Human
     Populations (1938).
     """
-    scene, tile = camera.scene, camera.tile
+    scene, tile, met = camera.scene, camera.tile, known.met
     straight = _in_tiles(scene, camera.radiance, rays, None, settings=STRAIGHT, tile=tile).linear
-    hits = np.zeros(rays.radii.shape, bool)
-    if camera.settings.max_bends > 0:
-        hits, _, _ = images.split_by_hit(scene.surfaces, rays, tile=tile, instead=_INSTEAD)
-    hits &= met.any(axis=1, keepdims=True)
-    share = hits.mean(axis=1, keepdims=True) / np.maximum(1, met.sum(axis=1, keepdims=True))
-    glass, lost = (np.sum(x, axis=1, where=met[..., None]) for x in (linear, dropped))
+    hits, edges = np.zeros(rays.radii.shape, bool), met.any(axis=1)
+    past = jax.tree.map(lambda x: x[edges], rays)
+    hits[edges], _, _ = images.split_by_hit(scene.surfaces, past, tile=tile, instead=_INSTEAD)
+    bent = hits & (np.indices((side_of(hits.shape[1]),) * 2).sum(axis=0).ravel() % 2 == 0)
+    chosen = jax.tree.map(lambda x: x[bent], rays)
+    more = _in_tiles(scene, camera.radiance, chosen, None, settings=camera.settings, tile=tile)
+    glass, lost = (np.sum(x, axis=1, where=met[..., None]) for x in (known.linear, known.dropped))
+    for total, added in (glass, more.linear), (lost, more.dropped):
+        np.add.at(total, np.nonzero(bent)[0], added)
+    share = hits.mean(axis=1) / np.maximum(1, met.sum(axis=1) + bent.sum(axis=1))
+    share = share.astype(glass.dtype)[:, None]
     beside = np.sum(straight, axis=1, where=~hits[..., None]) / rays.radii.shape[1]
-    return beside + np.where(share > 0.0, share * glass, 0.0), share * lost
+    linear = beside + np.where(share > 0.0, share * glass, 0.0)
+    return linear, share * lost, past.radii.size + more.casts
 
 
 @functools.partial(jit_quickly, static_argnames="settings")
