@@ -26,7 +26,7 @@ from refref_jax.reconstruct.masks import Views, overlaps, views_at
 from refref_jax.reconstruct.mesh_distance import silhouettes
 from refref_jax.reconstruct.outlines import Outlines
 from refref_jax.reconstruct.photometry import Backdrop, Photographs
-from refref_jax.reconstruct.polyhedra import fit_polyhedron
+from refref_jax.reconstruct.polyhedra import fit_polyhedron, with_right_angles
 from refref_jax.reconstruct.polytope_fit import fit_polytope
 from refref_jax.reconstruct.shapes import FixedShape, Shape, Unknowns, mesh_of
 
@@ -298,8 +298,10 @@ def _near_outlines(carved: Mesh, views: Views) -> list[Shape]:
     """Returns the families that may explain the outlines of an object."""
     *near, _ = families.candidates(carved, furthest=_NEAR_OUTLINES)
     bodies = (fit_polytope(carved, views, tolerance=each) for each in _TOLERANCES)
-    polyhedra = [None if body is None else fit_polyhedron(body) for body in bodies]
-    return [*near, *(each for each in polyhedra if each is not None)]
+    polyhedra = [fit_polyhedron(body) for body in bodies if body is not None]
+    found = [each for each in polyhedra if each is not None]
+    angled = (with_right_angles(each) for each in found)
+    return [*near, *found, *(each for each in angled if each is not None)]
 
 
 def _judged_by_masks(shape: Shape, mesh: Mesh, judges: Views) -> OutlineTrial:

@@ -66,6 +66,10 @@ _AGREES = 0.8
 # Largest distance of a corner from the mesh, as a share of the diameter.
 _REACHED = 0.05
 
+# Largest angle between faces that are taken to be parallel or perpendicular, and the share of the
+# largest singular value below which their derivatives depend on each other.
+_RIGHT, _DEPENDENT = np.radians(3.0), 1e-2
+
 # Corners nearer to each other than this share of the diameter are one.
 _SAME = 0.01
 
@@ -164,6 +168,89 @@ class Polyhedron:
         """Returns 0.02 radians and 0.77 % of the diameter."""
         size = diameter(self.pose(self.start()).vertices)
         return np.tile([LARGEST_TURN, LARGEST_TURN, LARGEST_STEP * size], len(self.planes))
+
+
+class RightAngledPolyhedron:
+    """A convex polyhedron, some of whose faces are parallel or at right angles, such as a box.
+
+    The unknowns are the coordinates of the planes in the null space of the derivatives of these
+    angles, in units of `Polyhedron.scales`. The angles stay as they are to first order: tilts of
+    half a degree change them by a few thousandths of a degree.
+
+    Attributes:
+      name: kind of the shape.
+    """
+
+    name = "polyhedron with right angles"
+
+    def __init__(
+        self, planes: Polyhedron, origin: Unknowns, basis: Float[np.ndarray, "n m"]
+    ) -> None:
+        """Takes a polyhedron, its unknowns where the angles are right, and the null space."""
+        self._planes, self._origin, self._basis = planes, origin, basis
+
+    @property
+    def faces(self) -> Int[np.ndarray, "faces 3"]:
+        """Returns the triangles."""
+        return self._planes.faces
+
+    def start(self) -> Unknowns:
+        """Returns zeros: the polyhedron that is nearest to the fit."""
+        return np.zeros(self._basis.shape[1])
+
+    def pose(self, unknowns: Unknowns) -> Posed:
+        """Returns the polyhedron."""
+        found = self._planes.pose(self._origin + self._basis @ unknowns)
+        by_vertices, by_normals = found.by_vertices @ self._basis, found.by_normals @ self._basis
+        return found._replace(by_vertices=by_vertices, by_normals=by_normals)
+
+    def prior(self, unknowns: Unknowns) -> tuple[Matrix, Unknowns]:
+        """Returns the prior: planes near those of the start, as `Polyhedron.prior` states it."""
+        precision, _ = self._planes.prior(self._origin)
+        here = self._basis.T @ precision @ self._basis
+        return here, here @ unknowns
+
+    def scales(self) -> Unknowns:
+        """Returns ones."""
+        return np.ones(self._basis.shape[1])
+
+
+def with_right_angles(polyhedron: Polyhedron) -> RightAngledPolyhedron | None:
+    """Makes faces that are nearly parallel or perpendicular exactly so.
+
+    Args:
+      polyhedron: one near the object.
+
+    Returns:
+      `None` if no two faces are within 3 degrees of either.
+    """
+    normals = polyhedron.planes[:, :3]
+    agree = np.triu(normals @ normals.T, k=1)
+    opposite = np.argwhere(agree < -np.cos(_RIGHT))
+    upright = np.argwhere(np.triu(np.abs(agree) < np.sin(_RIGHT), k=1))
+    if not len(opposite) + len(upright):
+        return None
+    x, scales = polyhedron.start(), polyhedron.scales()
+    for _ in range(_FITS):
+        errors, slopes = _angles(polyhedron.pose(x), opposite, upright)
+        x = x - scales * (np.linalg.pinv(slopes * scales, rcond=_DEPENDENT) @ errors)
+    _, slopes = _angles(polyhedron.pose(x), opposite, upright)
+    _, sizes, rows = np.linalg.svd(slopes * scales)
+    rank = np.count_nonzero(sizes > _DEPENDENT * sizes[0])
+    return RightAngledPolyhedron(polyhedron, x, scales[:, None] * rows[rank:].T)
+
+
+def _angles(
+    posed: Posed, opposite: Int[np.ndarray, "pairs 2"], upright: Int[np.ndarray, "others 2"]
+) -> tuple[Float[np.ndarray, " errors"], Float[np.ndarray, "errors n"]]:
+    """Returns sines of angles that shall be 180 degrees, cosines of right ones, and derivatives."""
+    count = len(posed.normals)
+    n, dn = posed.normals, csr_array(posed.by_normals).toarray().reshape(count, 3, -1)
+    (a, b), (c, d) = opposite.T, upright.T
+    turned = np.cross(dn[a], n[b][..., None], axis=1) + np.cross(n[a][..., None], dn[b], axis=1)
+    leant = np.einsum("pk,pkj->pj", n[d], dn[c]) + np.einsum("pk,pkj->pj", n[c], dn[d])
+    errors = np.concatenate([np.cross(n[a], n[b]).ravel(), np.sum(n[c] * n[d], axis=-1)])
+    return errors, np.concatenate([turned.reshape(-1, dn.shape[-1]), leant])
 
 
 def _blocks(

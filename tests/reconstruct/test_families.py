@@ -15,7 +15,7 @@ from refref_jax.reconstruct.families import (
     fit_sphere,
     fit_torus,
 )
-from refref_jax.reconstruct.polyhedra import fit_polyhedron
+from refref_jax.reconstruct.polyhedra import fit_polyhedron, with_right_angles
 from refref_jax.reconstruct.revolution import (
     Axis,
     Profile,
@@ -293,6 +293,50 @@ def test_corners_where_five_planes_meet():
     posed_surfaces.assert_closed(posed)
     posed_surfaces.assert_derivatives(shape)
     posed_surfaces.assert_prior(shape)
+
+
+def _prism(sides, *, warp=0.0):
+    """A prism with as many sides; the top of one with five is cut at an angle.
+
+    A projective map keeps its faces flat, but not their angles.
+    """
+    angle = 2.0 * np.pi * np.arange(sides) / sides
+    ring = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    top = 0.7 + (0.3 * ring[:, :1] if sides == 5 else np.zeros((sides, 1)))
+    low, high = np.append(ring, np.full((sides, 1), -0.7), axis=1), np.append(ring, top, axis=1)
+    points = np.concatenate([low, high]) @ _TURN.T
+    return bodies.as_mesh(convex_hull(points / (1.0 + points @ (warp * np.ones((3, 1))))))
+
+
+# A box has a turn and six distances. A prism with n sides has the direction of its axis, as many
+# azimuths as pairs of sides, and n + 2 distances; with five sides each has its azimuth, and the top
+# has its tilt.
+@pytest.mark.parametrize(("sides", "unknowns"), [(4, 9), (6, 13), (5, 16)])
+def test_nearly_right_angles_become_right(sides, unknowns):
+    warped = fit_polyhedron(_prism(sides, warp=0.004))
+    shape = with_right_angles(warped)
+    assert len(shape.start()) == unknowns
+    off, true = (each.planes[:, :3] for each in (warped, fit_polyhedron(_prism(sides))))
+    true = true[np.argmax(off @ true.T, axis=1)]
+    exact, off = true @ true.T, off @ off.T
+    right = (np.abs(exact) < 1e-9) | (exact < -1.0 + 1e-9)
+    assert np.abs(off - exact)[right].max() > 2e-3
+    found = shape.pose(shape.start())
+    np.testing.assert_allclose((found.normals @ found.normals.T)[right], exact[right], atol=1e-9)
+    posed_surfaces.assert_closed(found)
+    posed_surfaces.assert_derivatives(shape)
+    posed_surfaces.assert_prior(shape)
+    # A step of half a degree keeps them, to first order.
+    moved = shape.pose(np.random.default_rng(0).normal(0.0, 0.3, unknowns)).normals
+    np.testing.assert_allclose((moved @ moved.T)[right], exact[right], atol=1e-3)
+
+
+def _tetrahedron():
+    return bodies.as_mesh(convex_hull(np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])))
+
+
+def test_a_polyhedron_without_right_angles_has_none():
+    assert with_right_angles(fit_polyhedron(_tetrahedron())) is None
 
 
 @pytest.mark.slow

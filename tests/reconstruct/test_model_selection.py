@@ -86,7 +86,7 @@ def test_a_ball_on_a_table_is_found_in_masks_whose_edges_are_wrong():
 def test_a_box_on_a_table_has_its_six_planes():
     views = _views_from_above(_turned_box, pixels=2.0)
     found = model_selection.shape_from_outlines(_carved(views), views)
-    assert found is not None and found.name == "polyhedron"
+    assert found is not None and found.name == "polyhedron with right angles"
     corners = np.unique(np.round(found.mesh.vertices, 6), axis=0)
     assert len(corners) == 8
     away = np.linalg.norm(corners[:, None] - _CORNERS, axis=-1).min(axis=0)
