@@ -30,6 +30,12 @@ _IOR = flags.DEFINE_string(
 _RECONSTRUCTION = r3f_flags.reconstruction()
 _SPACE = r3f_flags.space()
 _PROPERTIES = cli_flags.properties()
+_EXPOSURE = flags.DEFINE_enum(
+    "exposure",
+    "fixed",
+    ["fixed", "per_image"],
+    "Exposure of the images: one, or a gain for each image and channel, learned beside the object.",
+)
 _SEED = cli_flags.seed()
 cli_flags.allow_outside()
 
@@ -51,7 +57,12 @@ def main() -> None:
         scene, _PROPERTIES.value or "", space=_SPACE.chosen(), radius=_SPACE.radius.value
     )
     config = _RECONSTRUCTION.chosen(
-        index=index, seed=_SEED.value, space=space, radius=radius, centre=centre
+        index=index,
+        seed=_SEED.value,
+        space=space,
+        radius=radius,
+        centre=centre,
+        exposure=_EXPOSURE.value,
     )
     found = chain.reconstruct(scene, out, config, compare=True)
     print(f"Report:  {out / report.FILE}, {out / report.FOLDER}")

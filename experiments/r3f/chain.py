@@ -5,7 +5,7 @@ import hashlib
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from experiments.r3f import (
     field_surface,
@@ -185,15 +185,7 @@ def _index(scene: Path, out: Path, found: Reconstruction) -> IndexFacts:
     folder = out / _INDEX_FOLDER
     folder.mkdir(exist_ok=True)
     mesh = object_source.read_mesh(out, found)
-    estimate = index_stage.run(
-        scene,
-        mesh,
-        folder,
-        seed=config.seed,
-        space=config.space,
-        radius=config.radius,
-        centre=config.centre,
-    )
+    estimate = index_stage.run(scene, mesh, folder, **_background(config))
     if not math.isfinite(estimate.deviation):
         if config.refinement == "light":  # which may find out that the object is not solid
             return IndexFacts("estimated", estimate.index, None, estimate.error)
@@ -237,28 +229,27 @@ def _takes_families(scene: Path, out: Path, config: ReconstructionConfig) -> boo
     """Returns whether outlines choose a family of shapes: in front of a field, light cannot."""
     if config.refinement != "light" or config.geometry in field_surface.NAMES:
         return False
-    bounds = {"space": config.space, "radius": config.radius, "centre": config.centre}
-    return not index_stage.has_backdrop(scene, out / _INDEX_FOLDER, seed=config.seed, **bounds)
+    return not index_stage.has_backdrop(scene, out / _INDEX_FOLDER, **_background(config))
+
+
+def _background(config: ReconstructionConfig) -> dict[str, Any]:
+    """Returns the options of the background, by the names of `index_stage.learn_background`."""
+    names = "space", "radius", "centre", "exposure", "seed"
+    return {name: getattr(config, name) for name in names}
 
 
 def _light(scene: Path, out: Path, found: Reconstruction) -> LightFacts:
-    folder, seed = out / _INDEX_FOLDER, found.config.seed
+    folder = out / _INDEX_FOLDER
     folder.mkdir(exist_ok=True)
-    surface = index_stage.learn_backdrop(
-        scene,
-        folder,
-        seed=seed,
-        space=found.config.space,
-        radius=found.config.radius,
-        centre=found.config.centre,
-    )
+    surface = index_stage.learn_backdrop(scene, folder, **_background(found.config))
     return light_stage.run(
         scene,
         object_source.read_mesh(out, found),
         found.index,
         surface,
         out / light_stage.FOLDER / found.geometry.mesh,
-        seed=seed,
+        seed=found.config.seed,
+        gains=index_stage.read_gains(folder),
     )
 
 

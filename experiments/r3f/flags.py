@@ -35,11 +35,12 @@ class ReconstructionFlags(NamedTuple):
         space: str | None,
         radius: float | None,
         centre: choices.Position | None = None,
+        exposure: choices.Exposure = "fixed",
     ) -> records.ReconstructionConfig:
         """Returns the options of the reconstruction; an index of `None` is estimated."""
         geometry, resolution, outliers, refinement = (each.value for each in self)
         return records.ReconstructionConfig(
-            geometry, resolution, outliers, index, space, radius, refinement, seed, centre
+            geometry, resolution, outliers, index, space, radius, refinement, seed, centre, exposure
         )
 
 

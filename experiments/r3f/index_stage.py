@@ -11,17 +11,19 @@ for the refinement by light.
 """
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from experiments.cli import app
 from experiments.cli.progress import ProgressBar
 from experiments.figures import style
 from experiments.figures.style import COLOURS, pyplot
-from refref_jax.choices import SATURATED, Position, Space, Split
+from refref_jax.choices import SATURATED, Colour, Exposure, Position, Space, Split
 from refref_jax.data import image_files, scene_folder
 from refref_jax.data.scene_assembly import assemble_scene
 from refref_jax.geometry.cameras import pixel_rays
@@ -38,7 +40,7 @@ from refref_jax.reconstruct.refractive_index import (
     most_looks,
 )
 from refref_jax.reconstruct.shape_from_refraction import find_index, most_looks_at_backdrop
-from refref_jax.render import checkpoint_io
+from refref_jax.render import checkpoint_io, pixels
 from refref_jax.render.checkpoint_io import SavedModel
 from refref_jax.render.model import Model, ModelConfig, surface_of
 from refref_jax.training import fit, run_folder
@@ -65,7 +67,13 @@ _BEFORE = 1.5
 
 
 def photographs(
-    scene: Path, split: Split, *, seed: int, rays: int | None = None, margin: int = 1
+    scene: Path,
+    split: Split,
+    *,
+    seed: int,
+    rays: int | None = None,
+    margin: int = 1,
+    gains: Mapping[str, Colour] | None = None,
 ) -> Photographs:
     """Draws pixels well inside the masks of a split, evenly over its views.
 
@@ -75,6 +83,8 @@ def photographs(
       seed: seed of the draw.
       rays: approximate number of pixels, fewer if the masks contain fewer; all by default.
       margin: distance from the outlines, in pixels.
+      gains: gain of each image by its name, by which its linear colours are divided; saturated ones
+        stay as they are, since nobody knows how bright they were.
 
     Raises:
       ValueError: if there are no masks, or if they have no interior.
@@ -95,7 +105,18 @@ def photographs(
         chosen.append(picked + view * mask.size)
     view, row, column = np.unravel_index(np.concatenate(chosen), inside.shape)
     rgb = scene_folder.read_images(frames)[view, row, column].astype(np.float32) / 255.0
+    if gains is not None:
+        of_views = np.array([gains[name] for name in frames.names], np.float32)
+        rgb = _divided_by(of_views[view], rgb)
     return Photographs(pixel_rays(frames.cameras, view, row, column), rgb, view)
+
+
+def _divided_by(
+    gains: Float[np.ndarray, "pixels 3"], rgb: Float[np.ndarray, "pixels 3"]
+) -> Float[np.ndarray, "pixels 3"]:
+    linear = np.asarray(pixels.srgb_to_linear(jax.device_put(rgb))) / gains
+    found = np.asarray(pixels.linear_to_srgb(jax.device_put(linear)))
+    return np.where(rgb < SATURATED, found, rgb).astype(np.float32)
 
 
 def object_scene(mesh: Mesh, index: float) -> Scene:
@@ -112,6 +133,7 @@ def run(
     space: Space | None = None,
     radius: float | None = None,
     centre: Position | None = None,
+    exposure: Exposure = "fixed",
     start: float | None = None,
     steps: int = STEPS,
 ) -> IndexEstimate:
@@ -126,6 +148,7 @@ def run(
       radius: half-extent of the background cube, or radius of the sphere or of the uncontracted
         ball, world units; the scene's own if `None`.
       centre: centre of the background, world units; the scene's own if `None`.
+      exposure: whether the background learns a gain for each image.
       start: index from which to descend in addition to those of the search.
       steps: training steps of the background, if it is a field.
 
@@ -133,21 +156,20 @@ def run(
       ValueError: if the scene has no masks, or no pixel outside of them.
       KeyboardInterrupt: if the background's training was stopped; it has been saved.
     """
-    background = {"space": space, "radius": radius, "centre": centre}
+    background = {"space": space, "radius": radius, "centre": centre, "exposure": exposure}
     model = learn_background(scene, folder, seed=seed, steps=steps, **background)
-    surface = backdrop_of(folder, model)
+    surface, gains = backdrop_of(folder, model), read_gains(folder)
+    rays = RAYS if surface is None else MANY_RAYS
+    seen = photographs(scene, "train", seed=seed, rays=rays, gains=gains)
     if surface is None:
-        found = _find_before_field(
-            mesh, model, photographs(scene, "train", seed=seed, rays=RAYS), start
-        )
+        found = _find_before_field(mesh, model, seen, start)
     else:
-        pixels = photographs(scene, "train", seed=seed, rays=MANY_RAYS)
         search = IndexSearch(descents=2)
         with ProgressBar("index", most_looks_at_backdrop(search, start=start)) as bar:
             found = find_index(
                 mesh,
                 surface,
-                pixels,
+                seen,
                 search=search,
                 start=start,
                 seed=seed,
@@ -158,20 +180,20 @@ def run(
 
 
 def _find_before_field(
-    mesh: Mesh, model: Model, pixels: Photographs, start: float | None
+    mesh: Mesh, model: Model, seen: Photographs, start: float | None
 ) -> IndexEstimate:
     """Searches for the index in front of a field, whose colours are at most white.
 
     Saturated pixels, which may be brighter, are left out if there are others.
     """
-    search, dark = IndexSearch(), np.flatnonzero(np.all(pixels.rgb < SATURATED, axis=-1))
-    pixels = pixels.chosen(dark) if len(dark) else pixels
-    evidence = Evidence(model.params, *jax.device_put((pixels.rays, pixels.rgb)))
+    search, dark = IndexSearch(), np.flatnonzero(np.all(seen.rgb < SATURATED, axis=-1))
+    seen = seen.chosen(dark) if len(dark) else seen
+    evidence = Evidence(model.params, *jax.device_put((seen.rays, seen.rgb)))
     with ProgressBar("index", most_looks(search, start=start)) as bar:
         return estimate_index(
             evidence,
             object_scene(mesh, _BEFORE),
-            pixels.views,
+            seen.views,
             part=0,
             config=model.config,
             search=search,
@@ -194,6 +216,15 @@ def backdrop_of(folder: Path, model: Model) -> Backdrop | None:
     return make_backdrop(bounds, surface_of(model.params), coverage)
 
 
+def read_gains(folder: Path) -> dict[str, Colour] | None:
+    """Returns the gain of each training image by its name, if the background has learned them.
+
+    Args:
+      folder: folder of the stage.
+    """
+    return run_folder.read_gains(folder / BACKGROUND)
+
+
 def learn_background(
     scene: Path,
     folder: Path,
@@ -202,6 +233,7 @@ def learn_background(
     space: Space | None = None,
     radius: float | None = None,
     centre: Position | None = None,
+    exposure: Exposure = "fixed",
     steps: int = STEPS,
 ) -> Model:
     """Returns the background, which is learned first or resumed if necessary.
@@ -216,6 +248,7 @@ def learn_background(
       space: type of the background, see `run`.
       radius: size of the background, see `run`.
       centre: centre of the background, see `run`.
+      exposure: whether it learns a gain for each image.
       steps: number of training steps of a field.
 
     Raises:
@@ -223,8 +256,8 @@ def learn_background(
         started with another background.
       KeyboardInterrupt: if its training was stopped; it has been saved.
     """
-    bounds = {"space": space, "radius": radius, "centre": centre}
-    wanted = _resolved(scene, folder, steps=steps, seed=seed, **bounds)
+    given = {"space": space, "radius": radius, "centre": centre, "exposure": exposure}
+    wanted = _resolved(scene, folder, steps=steps, seed=seed, **given)
     return _learned(scene, folder / BACKGROUND, wanted)
 
 
@@ -252,12 +285,14 @@ def _resolved(
     space: Space | None = None,
     radius: float | None = None,
     centre: Position | None = None,
+    exposure: Exposure = "fixed",
     steps: int = STEPS,
 ) -> Resolved:
     """Returns how the background is to be learned; see `learn_background`."""
     config = TrainConfig().override(
         **{"scene": str(scene.resolve()), "pixels": "background", "paths": "straight"},
         **{"background": space, "radius": radius, "centre": centre, "seed": seed},
+        exposure=exposure,
     )
     facts, run = read_facts(config.scene, parts=()), folder / BACKGROUND
     wanted = resolve(config, facts)

@@ -17,7 +17,7 @@ stays as it is.
 
 import functools
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,7 +28,7 @@ from experiments.cli.progress import ProgressBar
 from experiments.r3f import index_stage, light_figures
 from experiments.r3f.records import UNEXPLAINED, IndexFacts, LightFacts, PartFacts, TrialFacts
 from refref_jax import atomic_files
-from refref_jax.choices import CLEAR, Split
+from refref_jax.choices import CLEAR, Colour, Split
 from refref_jax.data import meshes, scene_folder
 from refref_jax.geometry.rays import Rays
 from refref_jax.geometry.triangle_meshes import Mesh, face_vectors, volume
@@ -121,7 +121,14 @@ class RevolvedObject(NamedTuple):
 
 
 def run(
-    scene: Path, mesh: Mesh, known: IndexFacts, surface: Backdrop | None, target: Path, *, seed: int
+    scene: Path,
+    mesh: Mesh,
+    known: IndexFacts,
+    surface: Backdrop | None,
+    target: Path,
+    *,
+    seed: int,
+    gains: Mapping[str, Colour] | None = None,
 ) -> LightFacts:
     """Refines an object, and writes it if it is better.
 
@@ -132,11 +139,12 @@ def run(
       surface: backdrop; `None` if the background is a field.
       target: path of the mesh to write, in a folder of its own.
       seed: random seed.
+      gains: gain of each training image by its name; all images have one exposure by default.
     """
     if surface is None:
         reason = "the background is a field, not a surface at a known place"
         return LightFacts(kept=False, index=known.index, remark=reason)
-    seen = read(scene, seed=seed)
+    seen = read(scene, seed=seed, gains=gains)
     revolved = look_at_ends(scene, mesh, surface, seen, seed=seed)
     trials = fit(scene, mesh, known, surface, seen, revolved, seed=seed)
     masks, chosen, remark = choose(scene, mesh, trials)
@@ -240,15 +248,18 @@ def _solid_ends(revolved: RevolvedObject) -> list[Solid]:
     return found
 
 
-def read(scene: Path, *, seed: int) -> Seen:
+def read(scene: Path, *, seed: int, gains: Mapping[str, Colour] | None = None) -> Seen:
     """Returns the pixels to fit, and those that judge.
+
+    With gains of the training images, views of these judge, since others have unknown ones.
 
     Raises:
       ValueError: if no pixel is well inside a mask.
     """
-    fitted = index_stage.photographs(scene, "train", seed=seed, rays=_FITTED)
+    fitted = index_stage.photographs(scene, "train", seed=seed, rays=_FITTED, gains=gains)
     path = scene / "transforms_val.json"
-    held_out = scene_folder.read_frames(scene, "val") if path.is_file() else None
+    known = path.is_file() and gains is None
+    held_out = scene_folder.read_frames(scene, "val") if known else None
     if held_out is not None and held_out.masks and scene_folder.read_masks(held_out).any():
         judges = index_stage.photographs(scene, "val", seed=seed + 1, rays=_JUDGES)
         return Seen(fitted, judges, "val")

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Literal
 
 from refref_jax import atomic_files, configuration
-from refref_jax.choices import Position, Space
+from refref_jax.choices import Exposure, Position, Space
 
 FILE = "reconstruction.json"
 
@@ -48,6 +48,7 @@ class ReconstructionConfig:
       refinement: whether light refines the surface: `light`, or `none`.
       seed: random seed.
       centre: centre of the background, world units; `None` for the scene's own.
+      exposure: exposure of the images: one, or a gain for each, learned beside the object.
     """
 
     geometry: str
@@ -61,6 +62,7 @@ class ReconstructionConfig:
     )
     seed: int
     centre: Position | None = None
+    exposure: Exposure = "fixed"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,6 +15,7 @@ from experiments.runs import config_flags, refraction_indices
 from refref_jax.training.config import TrainConfig
 
 if TYPE_CHECKING:
+    from experiments.r3f import records
     from refref_jax.data.meshes import MeshPart
 
 METHOD = flags.DEFINE_enum(
@@ -173,26 +174,41 @@ def find(
         raise ValueError(
             f"{out} already contains a reconstruction. Continue with --resume, or change --out."
         )
-    overrides = config.overrides()  # a reconstruction makes its own decisions
-    space, radius, centre = chain.bounds_of(
-        scene,
-        config.scene.properties,
-        space=config.scene.space if "background" in overrides else None,
-        radius=config.scene.radius if "radius" in overrides else None,
-        centre=config.scene.centre if "centre" in overrides else None,
-    )
-    asked = _RECONSTRUCTED.chosen(
-        index=index, seed=config.seed, space=space, radius=radius, centre=centre
-    )
-    if records.exists(out) and (run / _CONFIG).is_file() and not _RECONSTRUCTED.refinement.present:
-        # The run has begun with its object, maybe before light refined objects by default.
-        asked = dataclasses.replace(asked, refinement=records.read(out).config.refinement)
+    asked = _asked(run, config, index)
     try:
         chain.reconstruct(scene, out, asked, compare=False)
     except KeyboardInterrupt:
         print("Stopped. Continue with the same command and --resume.")
         raise
     return chain.read_parts(out)
+
+
+def _asked(run: Path, config: TrainConfig, index: float | None) -> records.ReconstructionConfig:
+    """Returns the options of a run's reconstruction, which makes its own decisions."""
+    from experiments.r3f import chain, records
+
+    overrides, out = config.overrides(), run / FOLDER
+    names = {"space": "background", "radius": "radius", "centre": "centre"}
+    said: dict[str, Any] = {
+        key: config.get(name) if name in overrides else None for key, name in names.items()
+    }
+    scene = Path(config.scene.path)
+    space, radius, centre = chain.bounds_of(scene, config.scene.properties, **said)
+    asked = _RECONSTRUCTED.chosen(
+        index=index,
+        seed=config.seed,
+        space=space,
+        radius=radius,
+        centre=centre,
+        exposure=config.model.exposure or "fixed",
+    )
+    if records.exists(out) and (run / _CONFIG).is_file():
+        # The run has begun with its object, maybe with the defaults of an earlier version.
+        before = records.read(out).config
+        asked = dataclasses.replace(asked, exposure=before.exposure)
+        if not _RECONSTRUCTED.refinement.present:
+            asked = dataclasses.replace(asked, refinement=before.refinement)
+    return asked
 
 
 def with_parts(

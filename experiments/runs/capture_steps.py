@@ -69,7 +69,8 @@ def steps(source: Path, out: Path, options: Options) -> Iterator[Step]:
     training += [] if options.steps is None else [f"--steps={options.steps}"]
     if options.meshes is None:
         report = found / "report.md"
-        yield Step("reconstruct", (f"--scene={scene}", f"--out={found}"), report.is_file)
+        words = [f"--scene={scene}", f"--out={found}", f"--exposure={options.exposure}"]
+        yield Step("reconstruct", tuple(words), report.is_file)
         training.append(f"--reconstruction={found}")
     measures = model / "eval" / "test" / "metrics.json"
     yield Step("train", tuple(training), measures.is_file)

@@ -341,3 +341,24 @@ def _any_near(
     depth: Float[np.ndarray, "points planes"], tolerance: float
 ) -> Bool[np.ndarray, " points"]:
     return np.any(depth >= -tolerance, axis=1)
+
+
+def misses_boxes(
+    origin: Float[np.ndarray, "3"], directions: Float[np.ndarray, "n 3"], parts: Sequence[MeshPart]
+) -> Bool[np.ndarray, " n"]:
+    """Returns which rays from a point miss the bounding boxes of all parts.
+
+    Args:
+      origin: origin of the rays, world units.
+      directions: their directions, of any length.
+      parts: meshes.
+    """
+    misses = np.ones(len(directions), bool)
+    for part in parts:
+        planes = np.stack([np.min(part.vertices, axis=0), np.max(part.vertices, axis=0)]) - origin
+        with np.errstate(divide="ignore", invalid="ignore"):
+            low, high = (plane / directions for plane in planes)
+        # A ray within the plane of a face is 0/0 there, and counts as inside.
+        enters = np.nanmax(np.fmin(low, high), axis=1, initial=0.0)
+        misses &= enters > np.nanmin(np.fmax(low, high), axis=1, initial=np.inf)
+    return misses

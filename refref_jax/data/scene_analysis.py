@@ -11,7 +11,7 @@ determines which code is compiled. The background is opaque in every scene, so i
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -20,6 +20,8 @@ from refref_jax.choices import (
     CLEAR,
     NO_ABSORPTION,
     ORIGIN,
+    SATURATED,
+    Exposure,
     PartKind,
     Position,
     RuleName,
@@ -28,7 +30,13 @@ from refref_jax.choices import (
 )
 from refref_jax.data import background_fit, image_files, scene_folder
 from refref_jax.data.background_fit import Kind
-from refref_jax.data.mesh_queries import Containment, encloses, is_convex, winding_number
+from refref_jax.data.mesh_queries import (
+    Containment,
+    encloses,
+    is_convex,
+    misses_boxes,
+    winding_number,
+)
 from refref_jax.data.meshes import MeshPart
 from refref_jax.data.scene_folder import Frames
 from refref_jax.data.scene_properties import PartDescription, SceneProperties
@@ -45,6 +53,10 @@ _MOST_IMAGES, _PATCHES, _EDGE, _CELLS = 60, 16, 128, 128
 
 # Mean sRGB error of a patch that differs.
 _MISFIT = 0.05
+
+# Power of sRGB that is nearly linear light, and rounds in which gains of images are found.
+_GAMMA = 2.2
+_GAIN_ROUNDS = 20
 
 # Largest size of a background that is searched for, relative to the cameras' distance from its
 # centre; number of sizes at first; then cells per side of a face and steps between sizes.
@@ -252,6 +264,7 @@ def read_misfits(
     size: float,
     centre: Position,
     masked: bool,
+    exposure: Exposure = "fixed",
 ) -> float:
     """Returns the share of `misfits` of the training images, of which at most 60 are read.
 
@@ -262,15 +275,15 @@ def read_misfits(
       size: half edge of the cube, or radius of the sphere, world units.
       centre: centre of the background, world units.
       masked: whether the masks say where objects are, since the meshes are unknown.
+      exposure: exposure of the images, see `misfits`.
 
     Raises:
       SceneError: if a file is missing or broken.
     """
     frames, images = _read_some(scene)
     among = image_files.well_outside(scene_folder.read_masks(frames)) if masked else None
-    return misfits(
-        frames.cameras, images, parts, space=space, size=size, centre=centre, among=among
-    )
+    how: dict[str, Any] = {"among": among, "exposure": exposure}
+    return misfits(frames.cameras, images, parts, space=space, size=size, centre=centre, **how)
 
 
 def _read_some(scene: Path) -> tuple[Frames, UInt8[np.ndarray, "views h w 3"]]:
@@ -331,7 +344,8 @@ def fit_size_by_parallax(
     planar = planar_directions(cameras, row.ravel(), column.ravel())
     rays = np.stack([planar @ pose[:, :3].T for pose in cameras.poses])
     origins = cameras.poses[:, :, 3] - np.array(centre)
-    sees = np.stack([_misses(p[:, 3], d, parts) for p, d in zip(cameras.poses, rays, strict=True)])
+    from_where = zip(cameras.poses[:, :, 3], rays, strict=True)
+    sees = np.stack([misses_boxes(*each, parts) for each in from_where])
     seen = photographs[:, row.ravel(), column.ravel()] / 255.0
     space: Space = "spherical" if kind == "sphere" else "bounded"
 
@@ -382,6 +396,7 @@ def misfits(
     size: float,
     centre: Position = ORIGIN,
     among: Bool[np.ndarray, "views h w"] | None = None,
+    exposure: Exposure = "fixed",
 ) -> float:
     """Returns the share of patches of the images that see the background, but differ from it.
 
@@ -398,6 +413,8 @@ def misfits(
       size: half edge of the cube, or radius of the sphere, world units.
       centre: centre of the background, world units.
       among: mask of the pixels that may see the background; all by default.
+      exposure: exposure of the images; with `per_image`, each has gains of its own, which are
+        estimated first, and saturated pixels are left out.
 
     Returns:
       The share among the patches all of whose rays miss the boxes; 0 if there are none.
@@ -407,18 +424,19 @@ def misfits(
     edge = max(1, min(height, width) // stride // _PATCHES)
     rows, columns = (side // stride // edge for side in (height, width))
     row, column = np.mgrid[: rows * edge, : columns * edge] * stride + stride // 2
-    planar = planar_directions(cameras, row.ravel(), column.ravel())
     cells, direct = [], []
     for pose in cameras.poses:
-        directions, origin = planar @ pose[:, :3].T, pose[:, 3]
-        cells.append(_cells(origin - np.array(centre), directions, space=space, size=size))
-        direct.append(_misses(origin, directions, parts))
+        directions = planar_directions(cameras, row.ravel(), column.ravel()) @ pose[:, :3].T
+        cells.append(_cells(pose[:, 3] - np.array(centre), directions, space=space, size=size))
+        direct.append(misses_boxes(pose[:, 3], directions, parts))
     cell, sees = np.concatenate(cells), np.concatenate(direct)
     if among is not None:
         sees &= among[:, row, column].reshape(-1)
     seen = photographs[:, row, column].reshape(-1, 3).T / 255.0
-    number = np.maximum(np.bincount(cell[sees], minlength=6 * _CELLS**2), 1)
-    means = [np.bincount(cell[sees], each[sees], len(number)) / number for each in seen]
+    if exposure == "per_image":
+        sees &= np.all(seen < SATURATED, axis=0)
+        seen = _without_gains(seen, cell, sees, views)
+    means = _cell_means(seen, cell, sees)
 
     def averaged(values: np.ndarray) -> np.ndarray:
         return values.reshape(views, rows, edge, columns, edge).mean((2, 4))
@@ -428,6 +446,35 @@ def misfits(
         return 0.0
     errors = [averaged(mean[cell] - each) for mean, each in zip(means, seen, strict=True)]
     return float(np.mean(np.max(np.abs(errors), axis=0)[judged] > _MISFIT))
+
+
+def _cell_means(
+    seen: Float[np.ndarray, "3 n"], cell: Int[np.ndarray, " n"], sees: Bool[np.ndarray, " n"]
+) -> list[Float[np.ndarray, " cells"]]:
+    """Returns the mean of each channel in each cell, over the pixels that see the background."""
+    number = np.maximum(np.bincount(cell[sees], minlength=6 * _CELLS**2), 1)
+    return [np.bincount(cell[sees], each[sees], len(number)) / number for each in seen]
+
+
+def _without_gains(
+    seen: Float[np.ndarray, "3 n"],
+    cell: Int[np.ndarray, " n"],
+    sees: Bool[np.ndarray, " n"],
+    views: int,
+) -> Float[np.ndarray, "3 n"]:
+    """Returns sRGB of pixels, view by view, divided by the gain of each view and channel.
+
+    Gains of linear light, and means of cells, are found in turn by least squares.
+    """
+    linear = (seen**_GAMMA).reshape(3, views, -1)
+    gains = np.ones((3, views, 1))
+    for _ in range(_GAIN_ROUNDS):
+        means = _cell_means((linear / gains).reshape(seen.shape), cell, sees)
+        fitted = np.stack([sees * mean[cell] for mean in means]).reshape(linear.shape)
+        above, below = (np.sum(x * fitted, axis=2, keepdims=True) for x in (linear, fitted))
+        gains = np.where(below > 0.0, np.maximum(above, 1e-6) / np.maximum(below, 1e-6), 1.0)
+        gains /= np.exp(np.mean(np.log(gains), axis=1, keepdims=True))
+    return ((linear / gains) ** (1.0 / _GAMMA)).reshape(seen.shape)
 
 
 def _cells(
@@ -451,18 +498,3 @@ def _cells(
     place = np.clip(0.5 * cells * (others / np.abs(major) + 1.0), 0, cells - 1).astype(np.int64)
     face = 2 * axis[:, 0] + (major[:, 0] > 0.0)
     return (face * cells + place[:, 1]) * cells + place[:, 0]
-
-
-def _misses(
-    origin: Float[np.ndarray, "3"], directions: Float[np.ndarray, "n 3"], parts: Sequence[MeshPart]
-) -> Bool[np.ndarray, " n"]:
-    """Returns which rays miss the boxes around all parts."""
-    misses = np.ones(len(directions), bool)
-    for part in parts:
-        planes = np.stack([np.min(part.vertices, axis=0), np.max(part.vertices, axis=0)]) - origin
-        with np.errstate(divide="ignore", invalid="ignore"):
-            low, high = (plane / directions for plane in planes)
-        # A ray within the plane of a face is 0/0 there, and counts as inside.
-        enters = np.nanmax(np.fmin(low, high), axis=1, initial=0.0)
-        misses &= enters > np.nanmin(np.fmax(low, high), axis=1, initial=np.inf)
-    return misses

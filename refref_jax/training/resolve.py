@@ -74,7 +74,8 @@ class SceneFacts(NamedTuple):
       source: reason for `half_extent` and `centre`.
       centre: centre of the background, in scene.json, given or measured.
       stated: source of the kind of the background, such as `scene.json`; empty without one.
-      misfits: function of space, size and centre to `scene_analysis.misfits` of the scene's images.
+      misfits: function of space, size, centre and exposure to `scene_analysis.misfits` of the
+        scene's images.
     """
 
     analysis: SceneAnalysis
@@ -413,9 +414,10 @@ def _is_surface_alone(config: TrainConfig, facts: SceneFacts) -> tuple[bool, str
 def _share_of_misfits(config: TrainConfig, facts: SceneFacts) -> float:
     """Returns the share of the images that differs from the background; 0 if it is small."""
     space, size, centre = (config.get(name) for name in ("background", "radius", "centre"))
-    if facts.misfits is None or config.model.exposure == "per_image":
+    if facts.misfits is None:
         return 0.0
-    share = facts.misfits(space=space, size=size, centre=centre)
+    exposure = config.model.exposure or "fixed"
+    share = facts.misfits(space=space, size=size, centre=centre, exposure=exposure)
     return share if share > scene_analysis.MOST_MISFITS else 0.0
 
 

@@ -26,6 +26,7 @@ import orbax.checkpoint as ocp
 from jaxtyping import Float
 
 from refref_jax import atomic_files, configuration
+from refref_jax.choices import Colour
 from refref_jax.data.scene_folder import Frames
 from refref_jax.optics.media import Scene
 from refref_jax.render import checkpoint_io
@@ -329,6 +330,14 @@ def write_gains(run: Path, names: Sequence[str], gains: Float[np.ndarray, "views
     rows = zip(names, np.round(gains.astype(np.float64), 6).tolist(), strict=True)
     with atomic_files.written_file(run / _GAINS) as draft:
         draft.write_text(json.dumps(dict(rows), indent=2) + "\n", encoding="utf-8")
+
+
+def read_gains(run: Path) -> dict[str, Colour] | None:
+    """Reads the gain of each training image, by its name; `None` if the run has learned none."""
+    path = run / _GAINS
+    if not path.is_file():
+        return None
+    return {name: tuple(gain) for name, gain in json.loads(path.read_text("utf-8")).items()}
 
 
 def append_metrics(run: Path, line: dict[str, Any]) -> None:

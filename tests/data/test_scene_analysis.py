@@ -274,6 +274,23 @@ def test_a_wrong_size_of_the_background_is_seen_in_the_images(space):
     assert shares[0] < scene_analysis.MOST_MISFITS < 0.5 * shares[1]
 
 
+@pytest.mark.parametrize("space", ["bounded", "unbounded"])
+def test_gains_of_images_are_not_mistaken_for_something_in_front_of_the_background(space):
+    views, known = _room_views(), {"space": space, "size": 6.0}
+    gains = np.exp(np.random.default_rng(0).normal(0.0, 0.2, (len(views.poses), 1, 1, 3)))
+    clean, painted = (
+        np.round(np.clip(image * gains ** (1.0 / 2.2), 0.0, 255.0)).astype(np.uint8)
+        for image in (_photographs(views, space=space, blob=size) for size in (0.0, 0.4))
+    )
+    fixed, few, many = (
+        scene_analysis.misfits(views, images, (), **known, exposure=exposure)
+        for images, exposure in ((clean, "fixed"), (clean, "per_image"), (painted, "per_image"))
+    )
+    assert fixed > 0.2 and few < scene_analysis.MOST_MISFITS < 0.5 * many
+    dark = np.zeros_like(clean)
+    assert scene_analysis.misfits(views, dark, (), **known, exposure="per_image") == 0.0
+
+
 def test_pixels_that_only_see_objects_are_not_judged():
     views = _room_views()
     noise = np.random.default_rng(0).integers(256, size=(24, 96, 96, 3), dtype=np.uint8)

@@ -8,8 +8,10 @@ import shutil
 import numpy as np
 import pytest
 
+from benchmarks.oracles import colours
 from experiments.r3f import index_stage
-from refref_jax.data import meshes, scene_analysis, scene_folder
+from refref_jax.choices import SATURATED
+from refref_jax.data import image_files, meshes, scene_analysis, scene_folder
 from refref_jax.data.scene_assembly import shaded_mesh
 from refref_jax.reconstruct.refractive_index import IndexSearch
 from refref_jax.render import checkpoint_io
@@ -86,6 +88,52 @@ def test_a_backdrop_is_solved_beside_the_body_and_the_index_found_before_it(
     assert not np.any(among[0] & masks) and among[0].mean() > 0.2
     assert first.index == pytest.approx(1.5, abs=3e-3) and 0.0 < first.deviation < 3e-3
     assert len(first.descents) == 2 and (tmp_path / "index.png").stat().st_size > 5000
+
+
+def _with_drifting_exposure(scene, folder):
+    """Returns the scene with a gain of each training image and channel, and these gains."""
+    copy, generator = shutil.copytree(scene, folder / "drifting"), np.random.default_rng(0)
+    frames = scene_folder.read_frames(copy, "train")
+    drawn = generator.normal(0.0, 0.12, (len(frames.names), 3))
+    gains = np.exp(drawn - drawn.mean(axis=0))
+    for path, gain in zip(frames.images, gains, strict=True):
+        linear = colours.srgb_to_linear(image_files.read_rgb(path) / 255.0) * gain
+        image_files.write_rgb(path, np.clip(colours.linear_to_srgb(linear), 0.0, 1.0))
+    return copy, dict(zip(frames.names, gains.tolist(), strict=True))
+
+
+def test_photographs_are_divided_by_their_gains_but_where_they_are_saturated(ball_scene, tmp_path):
+    scene, gains = _with_drifting_exposure(ball_scene, tmp_path)
+    draw = functools.partial(index_stage.photographs, split="train", seed=0, rays=2000)
+    true, raw, seen = draw(ball_scene), draw(scene), draw(scene, gains=gains)
+    np.testing.assert_array_equal(true.views, seen.views)
+    saturated = raw.rgb >= SATURATED
+    assert np.abs(raw.rgb - true.rgb)[~saturated].mean() > 0.01
+    np.testing.assert_allclose(seen.rgb[~saturated], true.rgb[~saturated], atol=0.01)
+    np.testing.assert_array_equal(seen.rgb[saturated], raw.rgb[saturated])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("far_field", ["field", "backdrop"])
+def test_the_index_is_found_where_the_exposure_of_images_drifts(
+    ball_scene, tmp_path, monkeypatch, far_field
+):
+    (part,) = meshes.read_meshes(ball_scene)
+    monkeypatch.setattr(index_stage, "IndexSearch", _SEARCH)
+    monkeypatch.setattr(index_stage, "RAYS", 2048)
+    monkeypatch.setattr(index_stage, "MANY_RAYS", 6000)
+    scene, gains = _with_drifting_exposure(ball_scene, tmp_path)
+    scene = _unstated(scene, tmp_path) if far_field == "field" else scene
+    estimate = functools.partial(index_stage.run, scene, shaded_mesh(part), seed=3, start=1.49)
+    known = estimate(folder=tmp_path / "known", exposure="per_image")
+    unknown = estimate(folder=tmp_path / "unknown")
+    assert run_folder.read_config(tmp_path / "known" / "background").model.far_field == far_field
+    found = index_stage.read_gains(tmp_path / "known")
+    assert found.keys() == gains.keys() and index_stage.read_gains(tmp_path / "unknown") is None
+    ratio = np.array([found[name] for name in gains]) / np.array(list(gains.values()))
+    assert np.std(ratio / ratio.mean(axis=0)) < 0.04
+    assert known.index == pytest.approx(1.5, abs=0.006)
+    assert known.error < 0.8 * unknown.error
 
 
 def test_a_background_that_was_begun_as_a_field_stays_one(ball_scene, tmp_path, monkeypatch):
