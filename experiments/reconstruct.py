@@ -34,7 +34,8 @@ _EXPOSURE = flags.DEFINE_enum(
     "exposure",
     "fixed",
     ["fixed", "per_image"],
-    "Exposure of the images: one, or a gain for each image and channel, learned beside the object.",
+    "Exposure of the images: one, or a gain for each image and channel, learned from the pixels "
+    "around the object.",
 )
 _SEED = cli_flags.seed()
 cli_flags.allow_outside()

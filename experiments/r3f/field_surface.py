@@ -143,6 +143,7 @@ def _resolved(scene: Path, config: ReconstructionConfig) -> Resolved:
         radius=config.radius,
         centre=config.centre,
         seed=config.seed,
+        **({} if config.exposure == "fixed" else {"exposure": config.exposure}),
     )
     return resolve(asked, read_facts(asked.scene, parts=()))
 

@@ -87,7 +87,7 @@ def photographs(
         stay as they are, since nobody knows how bright they were.
 
     Raises:
-      ValueError: if there are no masks, or if they have no interior.
+      ValueError: if there are no masks, or if they have no interior, or an image has no gain.
     """
     frames = scene_folder.read_frames(scene, split)
     inside = image_files.well_inside(scene_folder.read_masks(frames), margin=margin)
@@ -106,6 +106,11 @@ def photographs(
     view, row, column = np.unravel_index(np.concatenate(chosen), inside.shape)
     rgb = scene_folder.read_images(frames)[view, row, column].astype(np.float32) / 255.0
     if gains is not None:
+        if unknown := [name for name in frames.names if name not in gains]:
+            raise ValueError(
+                f"The background has no gain of the image {unknown[0]}: images were added or "
+                "renamed after it was learned. Undo that, or reconstruct in another folder."
+            )
         of_views = np.array([gains[name] for name in frames.names], np.float32)
         rgb = _divided_by(of_views[view], rgb)
     return Photographs(pixel_rays(frames.cameras, view, row, column), rgb, view)

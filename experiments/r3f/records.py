@@ -48,7 +48,7 @@ class ReconstructionConfig:
       refinement: whether light refines the surface: `light`, or `none`.
       seed: random seed.
       centre: centre of the background, world units; `None` for the scene's own.
-      exposure: exposure of the images: one, or a gain for each, learned beside the object.
+      exposure: exposure of the images: one, or a gain for each, learned around the object.
     """
 
     geometry: str
@@ -340,4 +340,6 @@ def _told(name: str, value: object) -> object:
 
 _OPTIONS = {"index": "ior", "space": "background"}
 # First stage that an option affects, if it is not the geometry.
-_STAGES = dict.fromkeys(("index", "space", "radius", "centre"), "index") | {"refinement": "light"}
+_STAGES = dict.fromkeys(("index", "space", "radius", "centre", "exposure"), "index") | {
+    "refinement": "light"
+}

@@ -39,11 +39,13 @@ class Step:
       name: name of the command in `experiments`.
       options: its flags.
       made: function that returns whether its results are there.
+      added: those of its flags that earlier versions did not give.
     """
 
     name: str
     options: tuple[str, ...]
     made: Callable[[], bool]
+    added: tuple[str, ...] = ()
 
 
 def steps(source: Path, out: Path, options: Options) -> Iterator[Step]:
@@ -69,8 +71,8 @@ def steps(source: Path, out: Path, options: Options) -> Iterator[Step]:
     training += [] if options.steps is None else [f"--steps={options.steps}"]
     if options.meshes is None:
         report = found / "report.md"
-        words = [f"--scene={scene}", f"--out={found}", f"--exposure={options.exposure}"]
-        yield Step("reconstruct", tuple(words), report.is_file)
+        words, added = (f"--scene={scene}", f"--out={found}"), (f"--exposure={options.exposure}",)
+        yield Step("reconstruct", (*words, *added), report.is_file, added)
         training.append(f"--reconstruction={found}")
     measures = model / "eval" / "test" / "metrics.json"
     yield Step("train", tuple(training), measures.is_file)
@@ -102,7 +104,11 @@ def _check_same(step: Step, log: Path) -> None:
     """Rejects options that differ from those with which a step was begun before."""
     lines = log.read_text(encoding="utf-8").splitlines() if log.is_file() else []
     before = [line[2:] for line in lines if line.startswith("$ ")]
-    if before and before[-1] != app.shell(step.name, *step.options):
+    allowed = [app.shell(step.name, *step.options)]
+    if step.made():  # maybe by an earlier version
+        formerly = [each for each in step.options if each not in step.added]
+        allowed.append(app.shell(step.name, *formerly))
+    if before and before[-1] not in allowed:
         raise ValueError(
             f"{log.parents[1]} was begun with other options: {before[-1]}. Repeat them, or give "
             "another --out."

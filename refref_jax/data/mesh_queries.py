@@ -322,6 +322,17 @@ def encloses(outer: MeshPart, inner: MeshPart) -> bool:
     return bool(np.all(hull.vertices < len(outer.vertices)))
 
 
+def is_one_convex_object(outer: MeshPart, parts: Sequence[MeshPart]) -> bool:
+    """Returns whether a part is convex and contains all vertices of all other parts."""
+    return is_convex(outer) and all(encloses(outer, part) for part in parts if part is not outer)
+
+
+def any_inside(points: Float[np.ndarray, "points 3"], part: MeshPart) -> bool:
+    """Returns whether any of some points, such as cameras, is inside a part."""
+    winding = winding_number(part, np.asarray(points, np.float64))
+    return bool(np.any(np.abs(winding) > 0.5))
+
+
 def _lie_on(hull: ConvexHull, points: Float[np.ndarray, "points 3"], tolerance: float) -> bool:
     """Returns whether all points lie on the hull of their object: near the plane of some facet."""
     planes = np.asarray(hull.equations)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, Shaped, UInt8
 
 from refref_jax.choices import (
     CLEAR,
@@ -32,10 +32,10 @@ from refref_jax.data import background_fit, image_files, scene_folder
 from refref_jax.data.background_fit import Kind
 from refref_jax.data.mesh_queries import (
     Containment,
+    any_inside,
     encloses,
-    is_convex,
+    is_one_convex_object,
     misses_boxes,
-    winding_number,
 )
 from refref_jax.data.meshes import MeshPart
 from refref_jax.data.scene_folder import Frames
@@ -54,9 +54,9 @@ _MOST_IMAGES, _PATCHES, _EDGE, _CELLS = 60, 16, 128, 128
 # Mean sRGB error of a patch that differs.
 _MISFIT = 0.05
 
-# Power of sRGB that is nearly linear light, and rounds in which gains of images are found.
-_GAMMA = 2.2
-_GAIN_ROUNDS = 20
+# Power of sRGB that is nearly linear light; rounds in which gains of images are found, and the gain
+# below which 8 bits show too little of an image.
+_GAMMA, _GAIN_ROUNDS, _DARK = 2.2, 20, 0.1
 
 # Largest size of a background that is searched for, relative to the cameras' distance from its
 # centre; number of sizes at first; then cells per side of a face and steps between sizes.
@@ -132,10 +132,10 @@ def analyse(
     others = [part for part in parts if part.material.kind != "dielectric"]
     apart = [part for part in others if not any(encloses(body, part) for body in bodies)]
     outermost = bodies + apart
-    convex = len(outermost) == 1 and _is_one_convex_body(outermost[0], parts)
+    convex = len(outermost) == 1 and is_one_convex_object(outermost[0], parts)
     # Under other rules, a ray between two parts may count as outside of all parts.
     told_apart = rule == "nested" or len(parts) == 1
-    leaves_for_good = convex and told_apart and not _any_inside(cameras, outermost[0])
+    leaves_for_good = convex and told_apart and not any_inside(cameras.poses[:, :, 3], outermost[0])
     if convex and outermost[0].material.kind == "thin_sheet":
         leaves_for_good = False  # inside a closed sheet, light is still in the ambient medium
     return SceneAnalysis(
@@ -219,16 +219,6 @@ def _objects(analysis: SceneAnalysis) -> str:
     if analysis.parts > analysis.objects:
         text = f"{analysis.parts} parts in {text}"
     return text if analysis.convex or analysis.objects > 1 else f"{text} that is not convex"
-
-
-def _is_one_convex_body(body: MeshPart, parts: Sequence[MeshPart]) -> bool:
-    """Returns whether a part is convex and contains all vertices of all other parts."""
-    return is_convex(body) and all(encloses(body, part) for part in parts if part is not body)
-
-
-def _any_inside(cameras: Cameras, body: MeshPart) -> bool:
-    winding = winding_number(body, np.asarray(cameras.poses[:, :, 3], np.float64))
-    return bool(np.any(np.abs(winding) > 0.5))
 
 
 def _takes_light(part: MeshPart | PartDescription) -> bool:
@@ -435,8 +425,10 @@ def misfits(
     seen = photographs[:, row, column].reshape(-1, 3).T / 255.0
     if exposure == "per_image":
         sees &= np.all(seen < SATURATED, axis=0)
-        seen = _without_gains(seen, cell, sees, views)
-    means = _cell_means(seen, cell, sees)
+        gains = _gains(seen**_GAMMA, cell, sees, views)
+        sees &= np.all(gains > _DARK, axis=0)
+        seen = np.where(sees, (seen**_GAMMA / np.maximum(gains, _DARK)) ** (1.0 / _GAMMA), 0.0)
+    means = _cell_means(seen, cell, np.broadcast_to(sees, seen.shape))
 
     def averaged(values: np.ndarray) -> np.ndarray:
         return values.reshape(views, rows, edge, columns, edge).mean((2, 4))
@@ -449,32 +441,39 @@ def misfits(
 
 
 def _cell_means(
-    seen: Float[np.ndarray, "3 n"], cell: Int[np.ndarray, " n"], sees: Bool[np.ndarray, " n"]
-) -> list[Float[np.ndarray, " cells"]]:
-    """Returns the mean of each channel in each cell, over the pixels that see the background."""
-    number = np.maximum(np.bincount(cell[sees], minlength=6 * _CELLS**2), 1)
-    return [np.bincount(cell[sees], each[sees], len(number)) / number for each in seen]
+    seen: Float[np.ndarray, "3 n"], cell: Int[np.ndarray, " n"], weights: Shaped[np.ndarray, "3 n"]
+) -> Float[np.ndarray, "3 cells"]:
+    """Returns the weighted mean of each channel in each cell; 0 in cells without weight."""
+    count = 6 * _CELLS**2
+    sums, total = (
+        np.stack([np.bincount(cell, each, count) for each in values])
+        for values in (weights * seen, weights)
+    )
+    return np.divide(sums, total, out=np.zeros_like(sums), where=total > 0.0)
 
 
-def _without_gains(
-    seen: Float[np.ndarray, "3 n"],
+def _gains(
+    linear: Float[np.ndarray, "3 n"],
     cell: Int[np.ndarray, " n"],
     sees: Bool[np.ndarray, " n"],
     views: int,
 ) -> Float[np.ndarray, "3 n"]:
-    """Returns sRGB of pixels, view by view, divided by the gain of each view and channel.
+    """Returns the gain of the view of each pixel, whose pixels follow each other, by channel.
 
-    Gains of linear light, and means of cells, are found in turn by least squares.
+    Gains, whose mean is 1, and the radiance of cells are found in turn by least squares.
     """
-    linear = (seen**_GAMMA).reshape(3, views, -1)
-    gains = np.ones((3, views, 1))
+    gains = np.ones_like(linear)
     for _ in range(_GAIN_ROUNDS):
-        means = _cell_means((linear / gains).reshape(seen.shape), cell, sees)
-        fitted = np.stack([sees * mean[cell] for mean in means]).reshape(linear.shape)
-        above, below = (np.sum(x * fitted, axis=2, keepdims=True) for x in (linear, fitted))
-        gains = np.where(below > 0.0, np.maximum(above, 1e-6) / np.maximum(below, 1e-6), 1.0)
-        gains /= np.exp(np.mean(np.log(gains), axis=1, keepdims=True))
-    return ((linear / gains) ** (1.0 / _GAMMA)).reshape(seen.shape)
+        even = np.divide(linear, gains, out=np.zeros_like(linear), where=gains > 0.0)
+        fitted = sees * np.take(_cell_means(even, cell, sees * gains**2), cell, axis=1)
+        above, below = (
+            np.sum((x * fitted).reshape(3, views, -1), axis=2, keepdims=True)
+            for x in (linear, fitted)
+        )
+        of_views = np.divide(above, below, out=np.ones_like(above), where=below > 0.0)
+        of_views /= np.mean(of_views, axis=1, keepdims=True)
+        gains = np.repeat(of_views[..., 0], linear.shape[1] // views, axis=1)
+    return gains
 
 
 def _cells(

@@ -33,6 +33,7 @@ from refref_jax.reconstruct.shapes import (
     check,
     frame_along,
     independent_prior,
+    mesh_of,
     rms,
     robust_weights,
     tilt,
@@ -66,9 +67,11 @@ _AGREES = 0.8
 # Largest distance of a corner from the mesh, as a share of the diameter.
 _REACHED = 0.05
 
-# Largest angle between faces that are taken to be parallel or perpendicular, and the share of the
-# largest singular value below which their derivatives depend on each other.
+# Largest angle by which faces that are taken to be parallel or perpendicular are not, the share of
+# the largest singular value below which their derivatives depend on each other, and what may be
+# left of the angle, radians.
 _RIGHT, _DEPENDENT = np.radians(3.0), 1e-2
+_EXACT = 1e-6
 
 # Corners nearer to each other than this share of the diameter are one.
 _SAME = 0.01
@@ -222,7 +225,8 @@ def with_right_angles(polyhedron: Polyhedron) -> RightAngledPolyhedron | None:
       polyhedron: one near the object.
 
     Returns:
-      `None` if no two faces are within 3 degrees of either.
+      `None` if no two faces are within 3 degrees of either, or if all such angles together need a
+      plane to turn by more than that, as those of a frustum do.
     """
     normals = polyhedron.planes[:, :3]
     agree = np.triu(normals @ normals.T, k=1)
@@ -234,7 +238,12 @@ def with_right_angles(polyhedron: Polyhedron) -> RightAngledPolyhedron | None:
     for _ in range(_FITS):
         errors, slopes = _angles(polyhedron.pose(x), opposite, upright)
         x = x - scales * (np.linalg.pinv(slopes * scales, rcond=_DEPENDENT) @ errors)
-    _, slopes = _angles(polyhedron.pose(x), opposite, upright)
+    found = polyhedron.pose(x)
+    errors, slopes = _angles(found, opposite, upright)
+    turned = np.sum(found.normals * normals, axis=-1) < np.cos(_RIGHT)
+    inverted = np.sum(mesh_of(found).normals[:, 0] * face_vectors(*found[:2]), axis=-1) <= 0.0
+    if np.abs(errors).max() > _EXACT or np.any(turned) or np.any(inverted):
+        return None
     _, sizes, rows = np.linalg.svd(slopes * scales)
     rank = np.count_nonzero(sizes > _DEPENDENT * sizes[0])
     return RightAngledPolyhedron(polyhedron, x, scales[:, None] * rows[rank:].T)

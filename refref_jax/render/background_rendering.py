@@ -217,12 +217,12 @@ def render_known_camera(
     With `refined_rays_per_pixel`, a pixel is rendered again with that many rays if one of its rays
     and the eight rays around it, some of them of the next pixels, differ by more than `tolerance`.
     So edges, silhouettes and places where glass shrinks the background get many rays, and smooth
-    places few. The first rays keep the weight that their number gives them. One that is not bent
-    costs a thirtieth of the others: pixels beside the objects have at least four first rays, and
-    where a refined pixel shows the background past the objects, up to four times as many rays
-    measure it and its share of the pixel, and replace the first ones. Half of those that meet an
-    object are bent, too. All this is everything that is added where `refined_rays_per_pixel` is
-    `rays_per_pixel`.
+    places few. The first rays keep the weight that their number gives them. A straight ray costs a
+    thirtieth of a bent one: pixels beside the objects have at least four first rays, and where a
+    refined pixel shows the background past the objects, up to four times as many straight rays
+    measure it and its share of the pixel, and replace the first ones; half of those that meet an
+    object are bent, too. Where both numbers of rays are equal, only these are added, and pixels
+    whose rays all meet an object stay as they are.
 
     Args:
       scene: the scene.
@@ -285,7 +285,7 @@ def _check_refinement(count: int, refined: int | None, tolerance: float) -> None
     if refined is not None and not count <= refined:
         raise ValueError(
             f"refined_rays_per_pixel is {refined}, less than rays_per_pixel, {count}. Give a "
-            "larger square, or None."
+            "square that is not smaller, or None."
         )
 
 
@@ -430,7 +430,8 @@ def _with_more_background(
     share = share.astype(glass.dtype)[:, None]
     beside = np.sum(straight, axis=1, where=~hits[..., None]) / rays.radii.shape[1]
     linear = beside + np.where(share > 0.0, share * glass, 0.0)
-    return linear, share * lost, past.radii.size + more.casts
+    # What the bent ones meet first is known already, and counted once.
+    return linear, share * lost, past.radii.size + more.casts - chosen.radii.size
 
 
 @functools.partial(jit_quickly, static_argnames="settings")

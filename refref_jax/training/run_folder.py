@@ -333,11 +333,32 @@ def write_gains(run: Path, names: Sequence[str], gains: Float[np.ndarray, "views
 
 
 def read_gains(run: Path) -> dict[str, Colour] | None:
-    """Reads the gain of each training image, by its name; `None` if the run has learned none."""
+    """Reads the gain of each training image, by its name; `None` if the run has learned none.
+
+    Args:
+      run: folder of the run.
+
+    Raises:
+      ValueError: if the file is damaged.
+    """
     path = run / _GAINS
     if not path.is_file():
         return None
-    return {name: tuple(gain) for name, gain in json.loads(path.read_text("utf-8")).items()}
+    try:
+        read = json.loads(path.read_text("utf-8"))
+        gains = {name: (float(r), float(g), float(b)) for name, (r, g, b) in read.items()}
+    except (AttributeError, TypeError, ValueError) as error:
+        raise _damaged_gains(path, str(error)) from error
+    for name, gain in gains.items():
+        if not all(math.isfinite(each) and each > 0.0 for each in gain):
+            raise _damaged_gains(path, f"the gain of {name} is {gain}")
+    return gains
+
+
+def _damaged_gains(path: Path, why: str) -> ValueError:
+    return ValueError(
+        f"{path} cannot be read ({why}). Restore it, or train again in another folder."
+    )
 
 
 def append_metrics(run: Path, line: dict[str, Any]) -> None:

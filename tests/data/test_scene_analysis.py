@@ -287,6 +287,9 @@ def test_gains_of_images_are_not_mistaken_for_something_in_front_of_the_backgrou
         for images, exposure in ((clean, "fixed"), (clean, "per_image"), (painted, "per_image"))
     )
     assert fixed > 0.2 and few < scene_analysis.MOST_MISFITS < 0.5 * many
+    some = clean.copy()  # a lens cap, and a flash that misfired
+    some[3], some[7] = 0, some[7] // 30
+    assert scene_analysis.misfits(views, some, (), **known, exposure="per_image") <= few + 1e-3
     dark = np.zeros_like(clean)
     assert scene_analysis.misfits(views, dark, (), **known, exposure="per_image") == 0.0
 

@@ -79,6 +79,18 @@ def test_other_options_than_before_are_refused_before_anything_runs(called, tmp_
     assert not called
 
 
+def test_a_finished_step_of_an_earlier_version_is_kept(called, tmp_path):
+    _run(tmp_path)
+    log = tmp_path / "logs" / "reconstruct.txt"
+    log.write_text(log.read_text().replace(" --exposure=per_image", ""))
+    called.clear()
+    _run(tmp_path)
+    assert not called
+    (tmp_path / _RESULTS["reconstruct"]).unlink()
+    with pytest.raises(ValueError, match="begun with other options"):
+        _run(tmp_path)
+
+
 def test_a_step_that_fails_ends_in_one_line(tmp_path, monkeypatch):
     def run(name, *options, log):
         raise subprocesses.RunFailedError(f"experiments.{name}: error: no image")

@@ -331,6 +331,24 @@ def test_nearly_right_angles_become_right(sides, unknowns):
     np.testing.assert_allclose((moved @ moved.T)[right], exact[right], atol=1e-3)
 
 
+# Neighbouring sides of the narrower one are within 3 degrees of perpendicular; those of the wider
+# one are not, whose top and bottom are parallel.
+@pytest.mark.parametrize(("top", "unknowns"), [(0.5, 16), (0.7, None), (0.8, None)])
+def test_a_frustum_is_no_prism(top, unknowns):
+    square = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]])
+    low, high = (
+        np.append(square, -np.ones((4, 1)), axis=1),
+        np.append(top * square, np.ones((4, 1)), axis=1),
+    )
+    frustum = fit_polyhedron(bodies.as_mesh(convex_hull(np.concatenate([low, high]) @ _TURN.T)))
+    shape = with_right_angles(frustum)
+    assert (shape and len(shape.start())) == unknowns
+    if shape is not None:
+        np.testing.assert_allclose(
+            shape.pose(shape.start()).normals, frustum.planes[:, :3], atol=1e-9
+        )
+
+
 def _tetrahedron():
     return bodies.as_mesh(convex_hull(np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])))
 

@@ -341,6 +341,24 @@ def test_pixels_beside_the_objects_have_four_first_rays_where_others_are_refined
     np.testing.assert_allclose(seen.linear, np.where(met[..., None], one, four), atol=1e-5)
 
 
+def test_casts_of_a_refined_background_are_counted_once(scene):
+    options = {"rays_per_pixel": 4, "refined_rays_per_pixel": 4, "tolerance": 0.0}
+    seen = _image(scene, _environment(), **options)
+    few, many = _rays(2), _rays(4)
+    met, hits = (
+        np.isfinite(images.find_first_surface(scene.surfaces, rays).distances)
+        for rays in (few, many)
+    )
+    edges = _by_pixel(met, 2).any(axis=(2, 3)) & ~_by_pixel(met, 2).all(axis=(2, 3))
+    edges = np.repeat(np.repeat(edges, 4, axis=0), 4, axis=1)
+    bent = edges & hits & (np.indices(hits.shape).sum(axis=0) % 2 == 0)
+    first, again = (
+        render_known(scene, _environment(), rays, settings=TREE, tile=_TILE).casts
+        for rays in (few, jax.tree.map(lambda x: x[bent], many))
+    )
+    assert seen.casts == first + edges.sum() + again - bent.sum()
+
+
 @pytest.mark.parametrize("side", [1, 2, 3])
 def test_the_background_alone_is_measured_by_more_rays(scene, side):
     count, tolerance = side * side, 0.1

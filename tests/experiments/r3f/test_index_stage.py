@@ -113,6 +113,25 @@ def test_photographs_are_divided_by_their_gains_but_where_they_are_saturated(bal
     np.testing.assert_array_equal(seen.rgb[saturated], raw.rgb[saturated])
 
 
+def test_gains_that_do_not_fit_the_images_are_refused(ball_scene, tmp_path):
+    with pytest.raises(ValueError, match=r"no gain of the image .*renamed"):
+        index_stage.photographs(ball_scene, "train", seed=0, gains={"other": (1.0, 1.0, 1.0)})
+    file = tmp_path / "background" / "gains.json"
+    file.parent.mkdir()
+    assert index_stage.read_gains(tmp_path) is None
+    for content in (
+        "{",
+        "[]",
+        '{"a": 1}',
+        '{"a": [1, 2]}',
+        '{"a": [1, 0, 2]}',
+        '{"a": [1, NaN, 2]}',
+    ):
+        file.write_text(content)
+        with pytest.raises(ValueError, match=r"gains\.json cannot be read .*Restore it"):
+            index_stage.read_gains(tmp_path)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("far_field", ["field", "backdrop"])
 def test_the_index_is_found_where_the_exposure_of_images_drifts(
