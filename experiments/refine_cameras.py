@@ -1,4 +1,4 @@
-"""Refines the poses of a scene by what its images show beside the object.
+"""Refines the poses of a scene by what its images show beside the object, and through it.
 
 python -m experiments.refine_cameras --scene=SCENE --out=SCENE_refined
 
@@ -7,11 +7,18 @@ masks, and five pixels around them, are left out, since their light is bent; vie
 or with an empty one, are used as a whole. --out gets a copy of the scene with other poses, of all
 splits, and `cameras.json` with the corrections. Lenses are not changed. `docs/captures.md` explains
 the method.
+
+python -m experiments.refine_cameras --scene=SCENE_refined --reconstruction=runs/aligned --out=COPY
+
+refines poses that are nearly right by all pixels, also those that see an object that was aligned or
+reconstructed, where the background is the surface that `scene.json` states and images have one
+exposure.
 """
 
 from __future__ import annotations
 
 import math
+import tempfile
 from pathlib import Path
 
 from absl import flags
@@ -20,25 +27,39 @@ from etils import epy
 from experiments.cli import app, outputs
 from experiments.cli import flags as cli_flags
 from experiments.cli import scenes as cli_scenes
+from experiments.cli.progress import ProgressBar
 
 with epy.lazy_imports():
     import numpy as np
 
-    from experiments.cameras import bundle, refined_scene, refinement
+    from experiments.cameras import bundle, refined_scene, refinement, through_object
+    from experiments.r3f import alignment, chain, index_stage
+    from refref_jax.reconstruct import gauss_newton
 
 _SCENE = cli_flags.scene("The scene whose poses are refined")
 _OUT = cli_flags.out("Copy to write, which must not exist.")
 _DEGREES = flags.DEFINE_float(
-    "degrees", 0.5, "Expected error of given rotations, per axis, degrees.", 1e-3, 5.0
+    "degrees",
+    None,
+    "Expected error of given rotations, per axis, degrees: by default 0.5, or 0.05 with "
+    "--reconstruction.",
+    1e-3,
+    5.0,
 )
 _PERCENT = flags.DEFINE_float(
     "percent",
-    1.0,
+    None,
     "Expected error of given positions, per axis, percent of the cameras' mean distance from their "
-    "middle.",
+    "middle: by default 1, or 0.1 with --reconstruction.",
     1e-3,
     10.0,
 )
+_RECONSTRUCTION = flags.DEFINE_string(
+    "reconstruction",
+    None,
+    "Folder of a reconstruction or alignment of the object, through which poses are refined.",
+)
+_SEED = cli_flags.seed("Seed of the pixels that are compared with --reconstruction.")
 cli_flags.allow_outside()
 
 
@@ -50,17 +71,50 @@ def main() -> None:
     outputs.check_folder(out)
     before = refined_scene.read(scene)
     distance = refined_scene.mean_distance(before.views)
-    prior = bundle.Prior(math.radians(_DEGREES.value), 0.01 * _PERCENT.value * distance)
-    refined = refinement.refine(before.views, before.photos, prior=prior, report=print)
+    usual = (0.5, 1.0) if _RECONSTRUCTION.value is None else (0.05, 0.1)
+    given = (_DEGREES.value, _PERCENT.value)
+    degrees, percent = (usual[i] if given[i] is None else given[i] for i in range(2))
+    prior = bundle.Prior(math.radians(degrees), 0.01 * percent * distance)
+    if _RECONSTRUCTION.value is None:
+        refined = refinement.refine(before.views, before.photos, prior=prior, report=print)
+    else:
+        refined = _through_object(scene, Path(_RECONSTRUCTION.value), before, prior)
     refined_scene.write(scene, out, before, refined)
     turned = np.degrees(np.linalg.norm(refined.corrections[:, :3], axis=-1))
     moved = 100.0 * np.linalg.norm(refined.corrections[:, 3:], axis=-1) / distance
-    print(f"Views:   {len(turned)}, with {refined.sightings.min()} points or more each")
+    print(refined.describe())
     print(f"Turned:  {turned.mean():.3f} degrees on average, {turned.max():.3f} at most")
     print(f"Moved:   {moved.mean():.3f} % of the distance on average, {moved.max():.3f} at most")
-    print(f"Error:   {refined.error:.3f} pixels per axis")
     print(f"Scene:   {out}")
     print(f"Next: {app.shell('train', f'--scene={out}', f'--out={out}_run')}")
+
+
+def _through_object(
+    scene: Path, folder: Path, before: refined_scene.SceneViews, prior: bundle.Prior
+) -> through_object.RefinedThrough:
+    """Returns poses refined through an object.
+
+    Raises:
+      ValueError: if the folder has no object, or the background is not a known surface.
+    """
+    model, _ = alignment.placed_object(chain.read_parts(folder))
+    with tempfile.TemporaryDirectory() as draft:
+        surface = index_stage.learn_backdrop(scene, Path(draft), seed=_SEED.value)
+    if surface is None:
+        raise ValueError(
+            f"{scene}: the background is not a surface that scene.json states and the images show, "
+            "so that light behind the object is not known. Leave out --reconstruction."
+        )
+    with ProgressBar("cameras", through_object.STEPS) as bar:
+        return through_object.refine(
+            before.views,
+            before.photos,
+            gauss_newton.traced_object(model.pose(model.start())),
+            surface,
+            prior=prior,
+            seed=_SEED.value,
+            progress=lambda done, _: bar.show(done, "steps"),
+        )
 
 
 if __name__ == "__main__":

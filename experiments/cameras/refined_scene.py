@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from experiments.cameras.bundle import Views
 from experiments.cameras.refinement import Photo, Refined
+from experiments.cameras.through_object import RefinedThrough
 from refref_jax import atomic_files
 from refref_jax.choices import SPLITS
 from refref_jax.data import SceneError, image_files, scene_folder
@@ -77,7 +78,7 @@ def check_place(scene: Path, out: Path) -> None:
         raise SceneError(f"{out} is inside the scene {scene}. Give a folder next to it.")
 
 
-def write(scene: Path, out: Path, before: SceneViews, refined: Refined) -> None:
+def write(scene: Path, out: Path, before: SceneViews, refined: Refined | RefinedThrough) -> None:
     """Writes a copy of a scene with refined poses, which appears when it is complete.
 
     Args:
@@ -105,15 +106,15 @@ def _square(pose: Float[np.ndarray, "3 4"]) -> list[list[float]]:
     return [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]]
 
 
-def _record(before: SceneViews, refined: Refined) -> dict[str, object]:
+def _record(before: SceneViews, refined: Refined | RefinedThrough) -> dict[str, object]:
+    facts, of_views = refined.record()
     return {
-        "error_pixels": refined.error,
-        "points": len(refined.points),
+        **facts,
         "views": [
             {
                 "split": split,
                 "name": name,
-                "sightings": int(refined.sightings[number]),
+                **{key: values[number].item() for key, values in of_views.items()},
                 "turned_degrees": float(np.degrees(np.linalg.norm(correction[:3]))),
                 "moved": float(np.linalg.norm(correction[3:])),
                 "given": _square(before.views.poses[number]),

@@ -9,7 +9,7 @@
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.ndimage
@@ -67,6 +67,18 @@ class Refined(NamedTuple):
     sightings: Int[np.ndarray, " views"]
     points: Float[np.ndarray, "points 3"]
     error: float
+
+    def record(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        """Returns facts for `cameras.json`, and those of each view."""
+        facts = {"error_pixels": self.error, "points": len(self.points)}
+        return facts, {"sightings": self.sightings}
+
+    def describe(self) -> str:
+        """Returns a few lines of text."""
+        return (
+            f"Views:   {len(self.poses)}, with {self.sightings.min()} points or more each\n"
+            f"Error:   {self.error:.3f} pixels per axis"
+        )
 
 
 def refine(
