@@ -1,13 +1,13 @@
-"""Claim: light through an object of known place halves the errors that points beside it leave.
+"""Claim: comparing all pixels with renderings halves the errors that points beside it leave.
 
     python -m benchmarks.cameras_through_object --out=FOLDER
 
 Poses of scenes in front of a known surface are made wrong, by what `refine_cameras` leaves of a
-capture (0.015 degrees and 0.03 % of the distance, `benchmarks.cameras`) and by three times as much,
-root mean square. They are refined by all pixels, as `refine_cameras --reconstruction` does, once
-and again from the result; the backdrop is solved for with the wrong poses each time, from pixels
-beside the masks, and the object has its true place and shape. Errors are those of
-`benchmarks.cameras`: means and maxima over all views. Asserted is the claim after the first
+capture (0.015 degrees and 0.03 % of the distance, `benchmarks.cameras`) and by about three times
+as much, root mean square. They are refined by all pixels, as `refine_cameras --reconstruction`
+does, once and again from the result; the backdrop is solved for with the wrong poses each time,
+from pixels beside the masks, and the object has its true place and shape. Errors are those of
+`benchmarks.cameras`: means and maxima over all views. Asserted are the means after the first
 refinement. Writes `cameras_through_object.csv`.
 """
 

@@ -20,6 +20,7 @@ from __future__ import annotations
 import math
 import tempfile
 from pathlib import Path
+from typing import NamedTuple
 
 from absl import flags
 from etils import epy
@@ -33,7 +34,7 @@ with epy.lazy_imports():
     import numpy as np
 
     from experiments.cameras import bundle, refined_scene, refinement, through_object
-    from experiments.r3f import alignment, chain, index_stage
+    from experiments.r3f import alignment, chain, index_stage, records
     from refref_jax.reconstruct import gauss_newton
 
 _SCENE = cli_flags.scene("The scene whose poses are refined")
@@ -59,7 +60,7 @@ _RECONSTRUCTION = flags.DEFINE_string(
     None,
     "Folder of a reconstruction or alignment of the object, through which poses are refined.",
 )
-_SEED = cli_flags.seed("Seed of the pixels that are compared with --reconstruction.")
+_SEED = cli_flags.seed("With --reconstruction: seed of the backdrop and of the draw of pixels.")
 cli_flags.allow_outside()
 
 
@@ -69,37 +70,66 @@ def main() -> None:
     scene, out = cli_scenes.opened(_SCENE.value), Path(_OUT.value)
     refined_scene.check_place(scene, out)
     outputs.check_folder(out)
+    given = _RECONSTRUCTION.value
+    through = None if given is None else _object(Path(given))
     before = refined_scene.read(scene)
     distance = refined_scene.mean_distance(before.views)
-    usual = (0.5, 1.0) if _RECONSTRUCTION.value is None else (0.05, 0.1)
-    given = (_DEGREES.value, _PERCENT.value)
-    degrees, percent = (usual[i] if given[i] is None else given[i] for i in range(2))
+    usual = (0.5, 1.0) if through is None else (0.05, 0.1)
+    said = (_DEGREES.value, _PERCENT.value)
+    degrees, percent = (usual[i] if said[i] is None else said[i] for i in range(2))
     prior = bundle.Prior(math.radians(degrees), 0.01 * percent * distance)
-    if _RECONSTRUCTION.value is None:
+    if through is None:
         refined = refinement.refine(before.views, before.photos, prior=prior, report=print)
     else:
-        refined = _through_object(scene, Path(_RECONSTRUCTION.value), before, prior)
+        refined = _through_object(scene, through, before, prior)
     refined_scene.write(scene, out, before, refined)
     turned = np.degrees(np.linalg.norm(refined.corrections[:, :3], axis=-1))
     moved = 100.0 * np.linalg.norm(refined.corrections[:, 3:], axis=-1) / distance
     print(refined.describe())
-    print(f"Turned:  {turned.mean():.3f} degrees on average, {turned.max():.3f} at most")
-    print(f"Moved:   {moved.mean():.3f} % of the distance on average, {moved.max():.3f} at most")
+    print(f"Turned:  {turned.mean():.4f} degrees on average, {turned.max():.4f} at most")
+    print(f"Moved:   {moved.mean():.4f} % of the distance on average, {moved.max():.4f} at most")
     print(f"Scene:   {out}")
-    print(f"Next: {app.shell('train', f'--scene={out}', f'--out={out}_run')}")
+    follow = [f"--scene={out}", f"--out={out}_run"]
+    follow += [] if given is None else [f"--reconstruction={given}"]
+    print(f"Next: {app.shell('train', *follow)}")
+
+
+class _Object(NamedTuple):
+    """An object of known place: its model, and the options with which it was found."""
+
+    model: alignment.PlacedObject
+    config: records.ReconstructionConfig
+
+
+def _object(folder: Path) -> _Object:
+    """Reads the object of a reconstruction or an alignment.
+
+    Raises:
+      ValueError: if the folder has none, or it was found with a gain for each image.
+    """
+    model, _ = alignment.placed_object(chain.read_parts(folder))
+    config = records.read(folder).config
+    if config.exposure != "fixed":
+        raise ValueError(
+            f"{folder} was reconstructed with --exposure={config.exposure}, but cameras are "
+            "refined through an object with images of one exposure only. Leave out "
+            "--reconstruction."
+        )
+    return _Object(model, config)
 
 
 def _through_object(
-    scene: Path, folder: Path, before: refined_scene.SceneViews, prior: bundle.Prior
+    scene: Path, through: _Object, before: refined_scene.SceneViews, prior: bundle.Prior
 ) -> through_object.RefinedThrough:
     """Returns poses refined through an object.
 
     Raises:
-      ValueError: if the folder has no object, or the background is not a known surface.
+      ValueError: if the background is not a known surface.
     """
-    model, _ = alignment.placed_object(chain.read_parts(folder))
+    model, config = through
+    bounds = {"space": config.space, "radius": config.radius, "centre": config.centre}
     with tempfile.TemporaryDirectory() as draft:
-        surface = index_stage.learn_backdrop(scene, Path(draft), seed=_SEED.value)
+        surface = index_stage.learn_backdrop(scene, Path(draft), seed=_SEED.value, **bounds)
     if surface is None:
         raise ValueError(
             f"{scene}: the background is not a surface that scene.json states and the images show, "

@@ -93,6 +93,25 @@ def test_views_that_nothing_explains_stay_as_they_are(views, photos, surface, tr
     assert np.abs(found.corrections[1]).max() < 5e-3
 
 
+def test_judges_are_other_pixels_and_a_camera_may_be_in_the_middle(
+    photos, views, surface, traced, monkeypatch
+):
+    monkeypatch.setattr(through_object, "_PIXELS", 100)
+    fitted, judges = through_object._sample(photos, np.random.default_rng(0))
+    for view in range(len(photos)):
+        pairs = (zip(x.row[view], x.column[view], strict=True) for x in (fitted, judges))
+        assert not set.intersection(*map(set, pairs))
+    middle = views.poses.copy()
+    middle[0, :, 3] = middle[1:, :, 3].mean(axis=0)
+    found = through_object.refine(
+        views._replace(poses=middle), photos, traced, surface, prior=_PRIOR
+    )
+    assert np.all(np.isfinite(found.poses)) and np.all(np.isfinite(found.after))
+    one = views._replace(poses=np.repeat(views.poses[:1], 5, axis=0))
+    with pytest.raises(ValueError, match="at one place"):
+        through_object.refine(one, photos, traced, surface, prior=_PRIOR)
+
+
 @pytest.mark.slow
 def test_the_command_refines_through_an_aligned_object(ball_scene, tmp_path):
     scene = shutil.copytree(ball_scene, tmp_path / "ball")
@@ -118,4 +137,5 @@ def test_the_command_refines_through_an_aligned_object(ball_scene, tmp_path):
         before, after = (np.linalg.norm(x[:, part], axis=1).mean() for x in (drawn, left))
         assert after < 0.6 * before
     record = json.loads((out / refined_scene.RECORD).read_text())
-    assert record["error_srgb"] > 0.0 and {"before", "after"} <= record["views"][0].keys()
+    assert record["error_srgb"] > 0.0
+    assert {"error_before_srgb", "error_after_srgb"} <= record["views"][0].keys()
