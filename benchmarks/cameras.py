@@ -29,7 +29,7 @@ import scipy.ndimage
 from absl import app, flags
 from jaxtyping import Bool, Float, UInt8
 
-from experiments.cameras import bundle, refined_scene, refinement
+from experiments.cameras import bundle, refinement
 from experiments.cameras.bundle import Prior, Views
 from experiments.cameras.refinement import Photo
 from experiments.captures.lenses import Distortion, distort
@@ -158,7 +158,7 @@ def measure(made: Generated, report: Callable[[str], None] = print) -> list[Meas
         )
 
     rows = [row("", "given", views.poses, 0.0)]
-    distance = refined_scene.mean_distance(views)
+    distance = bundle.mean_distance(views)
     prior = Prior(math.radians(_PRIOR_DEGREES), 0.01 * _PRIOR_PERCENT * distance)
     for name, photos in (("perfect", perfect_photos(made)), ("photographs", flat_photos(made))):
         started = time.monotonic()

@@ -71,7 +71,7 @@ def _write_poses(scene: Path, poses: Float[np.ndarray, "views 3 4"]) -> None:
 def _refined(scene: Path, seed: int) -> through_object.RefinedThrough:
     """Returns refined poses of a scene, through its own meshes."""
     before = refined_scene.read(scene)
-    distance = refined_scene.mean_distance(before.views)
+    distance = bundle.mean_distance(before.views)
     folder = scene.with_name(f"{scene.name}_background")
     shutil.rmtree(folder, ignore_errors=True)
     surface = index_stage.learn_backdrop(scene, folder, seed=seed)

@@ -73,7 +73,7 @@ def main() -> None:
     given = _RECONSTRUCTION.value
     through = None if given is None else _object(Path(given))
     before = refined_scene.read(scene)
-    distance = refined_scene.mean_distance(before.views)
+    distance = bundle.mean_distance(before.views)
     usual = (0.5, 1.0) if through is None else (0.05, 0.1)
     said = (_DEGREES.value, _PERCENT.value)
     degrees, percent = (usual[i] if said[i] is None else said[i] for i in range(2))

@@ -84,6 +84,12 @@ class Solution(NamedTuple):
     deviations: Float[np.ndarray, "views 6"]
 
 
+def mean_distance(views: Views) -> float:
+    """Returns the mean distance of the cameras from their middle, world units."""
+    places = views.poses[..., 3]
+    return float(np.linalg.norm(places - places.mean(axis=0), axis=-1).mean())
+
+
 def corrected(
     poses: Float[np.ndarray, "views 3 4"], corrections: Float[np.ndarray, "views 6"]
 ) -> Float[np.ndarray, "views 3 4"]:

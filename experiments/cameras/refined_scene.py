@@ -60,12 +60,6 @@ def read(scene: Path) -> SceneViews:
     return SceneViews(Views(np.array(poses), np.array(focals), np.array(middles)), photos, names)
 
 
-def mean_distance(views: Views) -> float:
-    """Returns the mean distance of the cameras from their middle, world units."""
-    places = views.poses[..., 3]
-    return float(np.linalg.norm(places - places.mean(axis=0), axis=-1).mean())
-
-
 def check_place(scene: Path, out: Path) -> None:
     """Rejects an output folder that exists, or that is inside the scene.
 

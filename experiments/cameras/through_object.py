@@ -81,9 +81,9 @@ class _Sampled(NamedTuple):
     """Pixels of all views, as many of each.
 
     Attributes:
-      row: their rows.
-      column: their columns.
-      rgb: sRGB in `[0, 1]`.
+      row: row of each pixel.
+      column: column of each pixel.
+      rgb: sRGB of each pixel, in `[0, 1]`.
       usable: whether the rendering with the given poses is known: little light was dropped, and
         most of it comes from where pixels beside the object show the surface behind it.
     """
@@ -110,7 +110,7 @@ def refine(
       views: cameras with the given poses.
       photos: their images, of one exposure, and masks.
       traced: the object, see `photometry.assemble`.
-      surface: what is behind it.
+      surface: backdrop behind it.
       prior: standard deviations of the given poses.
       seed: seed of the draw of pixels.
       progress: function called with the number of steps done and their total.
@@ -118,9 +118,7 @@ def refine(
     Raises:
       ValueError: if all cameras are at one place.
     """
-    distance = float(
-        np.linalg.norm(views.poses[..., 3] - views.poses[..., 3].mean(axis=0), axis=1).mean()
-    )
+    distance = bundle.mean_distance(views)
     if not distance > 0.0:
         raise ValueError("All cameras are at one place. Give a scene with views from several.")
     generator = np.random.default_rng(seed)

@@ -222,7 +222,7 @@ def with_right_angles(polyhedron: Polyhedron) -> RightAngledPolyhedron | None:
     """Makes faces that are nearly parallel or perpendicular exactly so.
 
     Args:
-      polyhedron: one near the object.
+      polyhedron: polyhedron near the object.
 
     Returns:
       `None` if no two faces are within 3 degrees of either, or if all such angles together need a
