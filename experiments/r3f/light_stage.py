@@ -46,10 +46,11 @@ from refref_jax.reconstruct import (
     shape_from_refraction,
 )
 from refref_jax.reconstruct.bubbles import ObjectWithBubbles
+from refref_jax.reconstruct.contents import Solid
 from refref_jax.reconstruct.families import Revolution
 from refref_jax.reconstruct.interior_looks import SearchSettings
 from refref_jax.reconstruct.interior_search import Finding
-from refref_jax.reconstruct.interiors import Solid, Vessel
+from refref_jax.reconstruct.interiors import Vessel
 from refref_jax.reconstruct.masks import Views
 from refref_jax.reconstruct.model_selection import Trial
 from refref_jax.reconstruct.opaque_ends import OpaqueEnd

@@ -24,9 +24,9 @@ from refref_jax.geometry.triangle_meshes import diameter, face_normals, unit_vec
 from refref_jax.optics.interface_rules import NO_PARENT, nested
 from refref_jax.optics.media import INDEX_OF_AIR
 from refref_jax.reconstruct import ReconstructionError
+from refref_jax.reconstruct.contents import Solid
 from refref_jax.reconstruct.families import Sphere
 from refref_jax.reconstruct.gauss_newton import Candidate, Matrix
-from refref_jax.reconstruct.interiors import Solid
 from refref_jax.reconstruct.model_selection import ObjectModel
 from refref_jax.reconstruct.shapes import Posed, mesh_of
 

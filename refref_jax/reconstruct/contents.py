@@ -1,4 +1,4 @@
-"""What is inside a vessel, and where its unknowns are in a vector (NumPy only).
+"""What is inside a vessel, its parts and media, and where its unknowns are in a vector.
 
 Source: ours.
 """
@@ -6,8 +6,9 @@ Source: ours.
 import dataclasses
 from typing import Literal, NamedTuple
 
-Colour = tuple[float, float, float]
-"""Linear RGB."""
+from refref_jax.choices import CLEAR, NO_ABSORPTION, Colour
+from refref_jax.geometry.triangle_meshes import Mesh
+from refref_jax.optics.media import INDEX_OF_AIR
 
 GLASS_DEVIATION = 0.03
 """Standard deviation of the index of glass, which is nearly known."""
@@ -24,18 +25,20 @@ class Detail(NamedTuple):
       ridges: points that are added there if the wall has narrow ridges (`Revolution.knots`).
       inner: points along the inner wall, all of its pieces together.
       azimuths: number of half-planes.
+      relief: whether offsets of a relief are unknowns, if there is one.
     """
 
     outer: int = 112
     ridges: int = 128
     inner: int = 124
     azimuths: int = 96
+    relief: bool = True
 
 
 FINE = Detail()
 """Enough for photographs of 200 x 200 pixels."""
 
-COARSE = Detail(outer=72, ridges=0, inner=80, azimuths=64)
+COARSE = Detail(outer=72, ridges=0, inner=80, azimuths=64, relief=False)
 """Enough for a look through a blurred backdrop."""
 
 
@@ -96,7 +99,9 @@ class Interior:
 class Layout:
     """Where the unknowns of a vessel are; slices, empty for what it does not have."""
 
-    def __init__(self, interior: Interior, outer: int, inner: int, *, axis: int = 4) -> None:
+    def __init__(
+        self, interior: Interior, outer: int, inner: int, *, axis: int = 4, relief: int = 0
+    ) -> None:
         """Counts the unknowns."""
         self.axis, self.outer = slice(0, axis), slice(axis, axis + outer)
         at = axis + outer
@@ -112,6 +117,7 @@ class Layout:
         self.glass, self.liquid = take(1), take(interior.filled)
         self.tint, self.absorption = take(3 * interior.filled), take(3 * interior.filled)
         self.glass_tint = take(3 * interior.stained)
+        self.relief = take(relief)
         self.count = at
 
     def names(self) -> list[str]:
@@ -122,3 +128,48 @@ class Layout:
                 for number in range(each.start, each.stop):
                     found[number] = name
         return found
+
+
+@dataclasses.dataclass(frozen=True)
+class Solid:
+    """A part of a scene.
+
+    Attributes:
+      name: name of its material.
+      mesh: its surface.
+      index: index of refraction inside.
+      parent: part that contains it, or `NO_PARENT`.
+      tint: factor on light at each crossing of its surface, linear RGB.
+      absorption: absorption inside, linear RGB, per world unit.
+      radiance: linear RGB radiance of an opaque part, `None` for a clear one.
+    """
+
+    name: str
+    mesh: Mesh
+    index: float
+    parent: int
+    tint: Colour
+    absorption: Colour = NO_ABSORPTION
+    radiance: Colour | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Medium:
+    """A material of a vessel, and where its unknowns are."""
+
+    index: float
+    tint: Colour
+    absorption: Colour
+    index_at: slice
+    tint_at: slice
+    absorption_at: slice
+
+
+def media_of(now: Interior, at: Layout) -> dict[str, Medium]:
+    """Returns the materials of a vessel by their names, and where their unknowns are."""
+    fixed, clear = slice(0), NO_ABSORPTION
+    return {
+        "glass": Medium(now.glass, now.glass_tint, clear, at.glass, at.glass_tint, fixed),
+        "liquid": Medium(now.liquid, now.tint, now.absorption, at.liquid, at.tint, at.absorption),
+        "air": Medium(INDEX_OF_AIR, CLEAR, clear, fixed, fixed, fixed),
+    }

@@ -10,19 +10,17 @@ Sources: Pottmann and Randrup (1998) for axes, see `revolution`; the rest is our
 """
 
 import copy
-import math
 from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
-from scipy.ndimage import gaussian_filter1d
 from scipy.optimize import least_squares
 from trimesh.creation import icosphere
 
 from refref_jax.geometry.triangle_meshes import Mesh, diameter
 from refref_jax.reconstruct.polyhedra import fit_polyhedron
-from refref_jax.reconstruct.relief import Relief
+from refref_jax.reconstruct.relief import Offsets, Relief
 from refref_jax.reconstruct.revolution import (
     Axis,
     Curve,
@@ -33,7 +31,7 @@ from refref_jax.reconstruct.revolution import (
     fit_axis_and_profile,
     lathe,
     lengths,
-    profile_normals,
+    profile_places,
     turn_right,
 )
 from refref_jax.reconstruct.shapes import (
@@ -51,7 +49,13 @@ from refref_jax.reconstruct.shapes import (
     robust_weights,
     tilt,
 )
-from refref_jax.reconstruct.turned import Turned, place, place_on_axis
+from refref_jax.reconstruct.turned import (
+    Turned,
+    place,
+    place_on_axis,
+    place_raised,
+    without_unknowns,
+)
 from refref_jax.reconstruct.turned_fit import fit_turned
 
 # Standard deviations of the priors: positions and radii, as shares of the diameter, and angles, in
@@ -67,18 +71,12 @@ _ALONG_PROFILE, _AROUND_AXIS = 192, 128
 # Knots of the offset along a profile.
 _KNOTS = 36
 
-# Knots of a profile without ridges, their least height as a share of the diameter, and rounds.
-_BASE_KNOTS, _RIDGE, _RIDGE_ROUNDS = 20, 0.0005, 12
-
 # Rounds of robust weights. A torus is not tried if the first guess is further from the mesh than
 # this multiple of what is accepted; its tube is at most this share of the radius of its circle.
 _ROUNDS = 8
 _HOPELESS = 3.0
 _FATTEST = 0.98
 _EVALUATIONS = 30
-
-# Smoothing of the curvature that decides where a profile has points and knots, in its even steps.
-_CURVATURE_STEPS = 4.0
 
 
 class Sphere:
@@ -189,7 +187,6 @@ class Revolution:
       name: kind of the shape.
       axis: axis of the fit.
       points: profile of the fit, relative to the point of the axis.
-      base: the same without narrow parts that stand out, such as rings, where knots are many.
       directions: its outward normals.
       closed: whether the profile is closed.
       size: diameter of the body, world units.
@@ -211,14 +208,12 @@ class Revolution:
         """Takes the axis, its profile in even steps, the diameter, the relief, and the knots."""
         self.axis, self.closed, self.size = axis, profile.closed, size
         self.relief, self.knots = relief, knots
-        at, length = _places(profile, max(_ALONG_PROFILE, 3 * knots))
-        places, _ = _places(profile, _KNOTS)
-        self.points = self.base = _between_knots(profile, places)(at)
+        at, length = profile_places(profile, max(_ALONG_PROFILE, 3 * knots))
+        places, _ = profile_places(profile, _KNOTS)
         if knots > _KNOTS:
-            places = np.linspace(0.0, length, _BASE_KNOTS)
-            self.base = _between_knots(profile, places, ridges=_RIDGE * size)(at)
             places = np.linspace(0.0, length, knots)
-            self.points = _between_knots(profile, places)(at)
+        spline = _between_knots(profile, places)
+        self.points, self._at_knots = spline(at), spline(places)
         self._along = _slope_matrices(at, length, profile.closed)
         along = np.stack([m @ self.points[:, i] for i, m in enumerate(self._along)], axis=-1)
         self.directions = turn_right(along) / np.linalg.norm(along, axis=-1, keepdims=True)
@@ -230,6 +225,11 @@ class Revolution:
         poles = np.zeros(len(at), bool)
         poles[[0, -1]] = not profile.closed
         self._lathe = lathe(poles, segments, segments, _AROUND_AXIS)
+
+    @property
+    def is_fine(self) -> bool:
+        """Whether it may have narrow ridges, or a relief."""
+        return self.knots > _KNOTS or self.relief is not None
 
     def start(self) -> Unknowns:
         """Returns zeros: the axis and the profile of the fit."""
@@ -251,6 +251,12 @@ class Revolution:
         return place_on_axis(
             turned, self._lathe, _AROUND_AXIS, self.axis, unknowns[:4], relief=self.relief
         )
+
+    def raised(self, relief: Relief, offsets: Offsets) -> Posed:
+        """Returns the body with a relief and offsets of it, which are its last unknowns."""
+        turned, pose = without_unknowns(self.profile(self.start())), np.zeros(5)
+        at = (turned, self._lathe, _AROUND_AXIS, self.axis, pose)
+        return place_raised(*at, relief, offsets)
 
     def moved(self, unknowns: Unknowns) -> "Revolution":
         """Returns the body at given unknowns, at rest."""
@@ -294,40 +300,31 @@ class Revolution:
             return np.roll(one, 1, axis=0) - 2.0 * one + np.roll(one, -1, axis=0)
         return np.diff(one, 2, axis=0)
 
+    def curvature_changes(
+        self,
+    ) -> tuple[Float[np.ndarray, " changes"], Float[np.ndarray, "changes knots"]]:
+        """Returns how second differences of the profile change between knots, at rest.
+
+        Also their derivatives by the offsets. They are 0 along straight lines and arcs.
+        """
+        points, bends = self._at_knots, self.bends()
+        along = np.gradient(points, axis=0)
+        normals = turn_right(along) / np.linalg.norm(along, axis=-1, keepdims=True)
+        middle = slice(None) if self.closed else slice(1, -1)
+        rest = np.sum((bends @ points) * normals[middle], axis=-1)
+        return np.diff(rest), np.diff(bends, axis=0)
+
     def scales(self) -> Unknowns:
         """Returns 0.02 radians and 0.77 % of the diameter."""
         return np.repeat([LARGEST_TURN, LARGEST_STEP * self.size], [2, 2 + self.knots])
 
 
-def _places(profile: Profile, count: int) -> tuple[Float[np.ndarray, " count"], float]:
-    """Returns lengths along a profile, half of them even and half where it turns; its length."""
-    length = lengths(profile.curve)
-    normals = profile_normals(profile)
-    if profile.closed:
-        normals = np.concatenate([normals, normals[:1]])
-    before, after = normals[:-1], normals[1:]
-    angle = np.arctan2(
-        before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0], np.sum(before * after, axis=-1)
-    )
-    mode = "wrap" if profile.closed else "reflect"
-    turn = np.abs(gaussian_filter1d(angle, _CURVATURE_STEPS, mode=mode))
-    turn = gaussian_filter1d(turn, _CURVATURE_STEPS, mode=mode)
-    share = np.diff(length) / length[-1] + turn / turn.sum()
-    total = np.concatenate([[0.0], np.cumsum(share)])
-    ticks = np.linspace(0.0, total[-1], count + profile.closed)
-    at = np.interp(ticks, total, length)
-    return at[:count], float(length[-1])
-
-
-def _between_knots(
-    profile: Profile, knots: Float[np.ndarray, " knots"], *, ridges: float = math.inf
-) -> Callable[..., Curve]:
+def _between_knots(profile: Profile, knots: Float[np.ndarray, " knots"]) -> Callable[..., Curve]:
     """Returns the spline of given knots nearest to a profile: radii odd about the poles.
 
-    Shorter waves are noise, which no offset at the knots could remove. Points that are higher above
-    the spline than `ridges`, in world units, lose their weight.
+    Shorter waves are noise, which no offset at the knots could remove.
     """
-    points, normals = profile.curve, profile_normals(profile)
+    points = profile.curve
     length = lengths(points)
     one = np.eye(len(knots))
     if profile.closed:
@@ -335,15 +332,10 @@ def _between_knots(
     else:
         radii = CubicSpline(knots, one[:, 1:-1], bc_type="natural")  # zero at both poles
         cubics = [radii, CubicSpline(knots, one, bc_type="clamped")]
-    weights, matrices = np.ones((len(points), 1)), [cubic(length) for cubic in cubics]
-    for _ in range(1 if math.isinf(ridges) else _RIDGE_ROUNDS):
-        values = [
-            np.linalg.lstsq(weights * matrix, weights[:, 0] * points[:, i], rcond=None)[0]
-            for i, matrix in enumerate(matrices)
-        ]
-        near = np.stack([m @ v for m, v in zip(matrices, values, strict=True)], axis=-1)
-        above = np.sum((points - near)[: len(normals)] * normals, axis=-1) / ridges
-        weights[: len(above), 0] = 1.0 / np.hypot(1.0, np.maximum(above, 0.0))
+    values = [
+        np.linalg.lstsq(cubic(length), points[:, i], rcond=None)[0]
+        for i, cubic in enumerate(cubics)
+    ]
     return lambda s: np.stack([c(s) @ v for c, v in zip(cubics, values, strict=True)], axis=-1)
 
 

@@ -9,8 +9,7 @@ it is now, and solves
 for the change of the unknowns: `r` are errors of pixels in sRGB, `J` their derivatives, sparse ray
 by ray (`photometry`), `W` robust weights, `s` the typical error, and `P`, `p` the precision and the
 gradient of the prior. A step is taken if it explains other, fresh pixels better; otherwise `mu`
-grows. The backdrop is blurred at first, because a step can only find its way within the detail of
-what is seen through the object.
+grows. The backdrop is blurred at first: steps find their way only within its detail.
 
 The inverse of the matrix is the covariance of the unknowns, if errors of pixels are independent.
 Those of one view are not: a backdrop that is a little off shifts them alike. The scatter of the
@@ -18,13 +17,14 @@ gradients of whole views says by how much the covariance is too small.
 
 Sources: Geman and McClure (1987), robust weights; Blake and Zisserman (1987) and Black and
 Rangarajan (1996), weights that are wide at first; Levenberg (1944) and Marquardt (1963), damping;
-Liang and Zeger (1986), covariance from clusters of errors, here views;
-Wu, Zhou, Qian, Gong, Huang: Full 3D Reconstruction of Transparent Objects (2018), for shape from
-refracted light; the sparse Jacobian through traced triangles is ours.
+Liang and Zeger (1986), covariance from clusters of errors, here views; Wu et al.: Full 3D
+Reconstruction of Transparent Objects (2018), for shape from refracted light; the sparse Jacobian
+through traced triangles is ours.
 """
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
@@ -46,15 +46,13 @@ Matrix: TypeAlias = Float[np.ndarray, "_ _"] | scipy.sparse.csr_array
 # Errors of pixels beyond this, in sRGB, do not grow in the robust error.
 _CAP = 0.15
 
-# Smallest scale of the robust weights, in sRGB, and its ratio to the median error; smallest typical
-# error, near the rounding of 8 bits.
-_LEAST_SCALE, _SCALE, _LEAST_NOISE = 0.02, 1.5, 0.005
+# Smallest scale of the robust weights, in sRGB, its ratio to the median error, and its factor from
+# step to step; smallest typical error, near the rounding of 8 bits.
+_LEAST_SCALE, _SCALE, _NARROWING, _LEAST_NOISE = 0.02, 1.5, 0.9, 0.005
 
-# Factor of the least scale from step to step.
-_NARROWING = 0.9
-
-# Linear RGB below which the slope of sRGB is held: dark noise would weigh most.
-_DARK = 2e-3
+# Linear RGB below which the slope of sRGB is held: dark noise would weigh most. Share of non-zero
+# entries from which on a Jacobian is a dense matrix.
+_DARK, _FULL = 2e-3, 0.1
 
 # Pixels where less of the light was followed, or that end where fewer pixels saw the backdrop
 # directly, do not count.
@@ -378,6 +376,7 @@ def linearise(
     if candidate.by_absorptions is not None:
         jacobian = jacobian - _by_channels(light, found.lengths) @ candidate.by_absorptions
     weights *= _without_largest(jacobian, weights, settings.outliers)[:, None]
+    jacobian = _dense(jacobian, least=_FULL)
     flat = weights.reshape(-1)
     weighted = scipy.sparse.diags_array(flat) @ jacobian
     squared = float(np.sum(flat * error.reshape(-1) ** 2) / max(np.sum(flat), 1.0))
@@ -392,8 +391,10 @@ def linearise(
     return Equations(matrix / scale, by_view.sum(axis=0), by_view, matrix / scale)
 
 
-def _dense(matrix: Any) -> Float[np.ndarray, "_ _"]:
-    return matrix.toarray() if scipy.sparse.issparse(matrix) else matrix
+def _dense(matrix: Any, *, least: float = 0.0) -> Any:
+    """Returns a dense matrix, if at least this share of its entries is not zero."""
+    full = scipy.sparse.issparse(matrix) and matrix.nnz >= least * math.prod(matrix.shape)
+    return matrix.toarray() if full else matrix
 
 
 def _covariance(

@@ -59,6 +59,7 @@ class SearchSettings:
       few: blurs of the steps of the few numbers of a hypothesis.
       all: blurs of the steps of all unknowns, of each kind.
       last: blurs of the further steps of the best findings.
+      finest: those of the best finding alone, if its outer surface has narrow ridges or a relief.
       rays: number of pixels of a step of the few numbers.
       last_rays: number of pixels of a step of all unknowns.
       rivals: hypotheses whose error is above that of the best by more than this factor are left
@@ -81,6 +82,7 @@ class SearchSettings:
     few: tuple[int, ...] = (3, 3, 3, 2, 2, 2, 1, 1, 1)
     all: tuple[int, ...] = (2, 2, 1, 1, 0, 0, 0)
     last: tuple[int, ...] = (1, 0, 0, 0, 0, 0, 0, 0, 0, 0)
+    finest: tuple[int, ...] = (0,) * 12
     rays: int = 8192
     last_rays: int = 16384
     rivals: float = 1.25

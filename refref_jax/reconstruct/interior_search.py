@@ -196,7 +196,15 @@ def search(
         last = _fitted(vessel, x, surface, pixels, judges, settings, steps, outlines)
         say(f"{last.name}: further steps, error {last.error:.4f}")
         findings[number] = last
-    return Found(_simplest(findings), findings, looks)
+    best = _simplest(findings)
+    if settings.finest and outer.is_fine:
+        at = next(n for n, each in enumerate(findings) if each is best)
+        steps = settings.finest
+        findings[at] = best = _fitted(
+            best.vessel, best.x, surface, pixels, judges, settings, steps, outlines
+        )
+        say(f"{best.name}: finest steps, error {best.error:.4f}")
+    return Found(best, findings, looks)
 
 
 def _close(findings: Sequence[Finding], settings: SearchSettings) -> list[int]:

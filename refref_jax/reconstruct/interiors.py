@@ -15,6 +15,7 @@ Single-View Transmission Imaging (2017), for outer and inner profiles from refra
 """
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -23,26 +24,31 @@ import scipy.sparse
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from refref_jax.choices import CLEAR, NO_ABSORPTION
-from refref_jax.geometry.triangle_meshes import Mesh
 from refref_jax.optics.interface_rules import NO_PARENT, nested
-from refref_jax.optics.media import INDEX_OF_AIR
-from refref_jax.reconstruct import ReconstructionError, walls
-from refref_jax.reconstruct.contents import FINE, Colour, Detail, Interior, Layout
-from refref_jax.reconstruct.families import Revolution, place
+from refref_jax.reconstruct import ReconstructionError, relief, walls
+from refref_jax.reconstruct.contents import (
+    FINE,
+    Colour,
+    Detail,
+    Interior,
+    Layout,
+    Solid,
+    media_of,
+)
+from refref_jax.reconstruct.families import Revolution, place, place_raised
 from refref_jax.reconstruct.gauss_newton import Candidate
 from refref_jax.reconstruct.revolution import Curve, Profile, lathe
-from refref_jax.reconstruct.shapes import LARGEST_STEP, LARGEST_TURN, Posed, mesh_of
+from refref_jax.reconstruct.shapes import LARGEST_STEP, LARGEST_TURN, Matrix, Posed, mesh_of
 from refref_jax.reconstruct.walls import Limits, Moved, Outline, Stretch, Wall
 
 # Knots of the offsets of the outer and of the inner wall.
 _KNOTS, _INNER_KNOTS = 36, 28
 
 # Standard deviations of the priors, as shares of the diameter: shift of the axis; offsets of the
-# outer wall and their second differences; the same of the inner wall; level; gap. Angles are in
-# radians.
+# outer wall and their second differences, also with the knots of a fine profile; the same of the
+# inner wall; level; gap. Angles are in radians.
 _ANGLE, _SHIFT = 0.02, 0.01
-_OFFSET, _BEND = 0.008, 0.004
+_OFFSET, _BEND, _FINE_BEND = 0.008, 0.004, 0.0003
 _INNER_OFFSET, _INNER_BEND = 0.03, 0.012
 _LEVEL, _GAP = 0.12, 0.04
 
@@ -52,10 +58,7 @@ _LEVELLED, _LOOSER = 0.9, 5.0
 
 # The same of the index of a liquid, of the logarithm of a tint, and of absorption along the
 # diameter.
-_LIQUID, _TINT, _ABSORPTION = 0.1, 1.0, 5.0
-
-# The same of an index that is kept.
-_KEPT = 1e-9
+_LIQUID, _TINT, _ABSORPTION, _KEPT = 0.1, 1.0, 5.0, 1e-9
 
 # Largest changes in a step: of level and gap, as a share of the diameter, of an index, of the
 # logarithm of a tint, and of absorption along the diameter. The inner wall, which no mask shows,
@@ -78,43 +81,9 @@ _PARTS = 3
 # Fewest points of a piece of the inner wall.
 _FEWEST = 20
 
-# A mouth begins where the inner wall has turned this far from the horizontal.
-_UPRIGHT = 0.8
-
-
-@dataclasses.dataclass(frozen=True)
-class Solid:
-    """A part of a scene.
-
-    Attributes:
-      name: name of its material.
-      mesh: its surface.
-      index: index of refraction inside.
-      parent: part that contains it, or `NO_PARENT`.
-      tint: factor on light at each crossing of its surface, linear RGB.
-      absorption: absorption inside, linear RGB, per world unit.
-      radiance: linear RGB radiance of an opaque part, `None` for a clear one.
-    """
-
-    name: str
-    mesh: Mesh
-    index: float
-    parent: int
-    tint: Colour
-    absorption: Colour = NO_ABSORPTION
-    radiance: Colour | None = None
-
-
-@dataclasses.dataclass(frozen=True)
-class _Medium:
-    """A material of a vessel, and where its unknowns are."""
-
-    index: float
-    tint: Colour
-    absorption: Colour
-    index_at: slice
-    tint_at: slice
-    absorption_at: slice
+# Height by which the inner wall of an open vessel continues above it, as a share of the diameter;
+# depth of its rim, as a share of the wall.
+_ABOVE, _RIM = 0.05, 0.25
 
 
 class Vessel:
@@ -122,8 +91,8 @@ class Vessel:
 
     The unknowns (`layout`) are the tilt and the shift of the axis, offsets of the outer and of the
     inner wall along their normals at rest, the level, the gap, the indices of glass and liquid, the
-    logarithms of the tints, and the absorption of the liquid. The connectivity does not depend on
-    them.
+    logarithms of the tints, the absorption of the liquid, and offsets of the relief, if there is
+    one. The connectivity does not depend on them.
 
     Example:
       >>> vessel = Vessel(fit_revolution(mesh), Interior("liquid and air", wall=0.1, level=-0.2))
@@ -147,25 +116,33 @@ class Vessel:
         self.outer, self.interior_at_start, self.detail = outer, interior, detail
         profile = walls.with_punt(Profile(outer.points, closed=False), interior.punt)
         self.size = _size(outer.points)
+        knots = max(_KNOTS, outer.knots) if detail.ridges else _KNOTS
         points = detail.outer + (detail.ridges if outer.knots > _KNOTS else 0)
-        self._outer = Wall(profile, points=points, knots=_KNOTS)
+        self._outer = Wall(profile, points=points, knots=knots)
         self._looseness = self._find_looseness()
-        self.layout = Layout(interior, _KNOTS, _INNER_KNOTS)
+        raised = math.prod(relief.KNOTS) if detail.relief and outer.relief is not None else 0
+        self.layout = Layout(interior, knots, _INNER_KNOTS, relief=raised)
         if interior.contents != "none":
             ends = {"base": interior.base, "lid": interior.lid}
-            base = walls.with_punt(Profile(outer.base, closed=False), interior.punt)
-            space = walls.inset(base, interior.wall, self.size, **ends)
+            space = walls.inset(self._outside(profile), interior.wall, self.size, **ends)
             if space is None:
                 raise ReconstructionError(
                     f"A wall of {interior.wall:g}, a base of {interior.base:g} and a lid of "
                     f"{interior.lid:g} leave no space inside. Pass thinner ones."
                 )
             self._inner = Wall(space, points=detail.inner, knots=_INNER_KNOTS)
-            self._rest = self._limits()
             if interior.mouth:
                 self._rim = self._find_rim()
+            self._rest = self._limits()
             self._range = self._heights()
         self._plan = self._shares()
+
+    def _outside(self, profile: Profile) -> Profile:
+        """Returns what an inner wall follows: no ridges, and straight up above a mouth."""
+        found = profile
+        if self.interior_at_start.mouth:
+            found = walls.with_open_top(found, _ABOVE * self.size + self.interior_at_start.wall)
+        return walls.without_ridges(found, self.size) if self.outer.knots > _KNOTS else found
 
     def _find_looseness(self) -> Float[np.ndarray, " knots"]:
         """Returns factors of the deviations of the outer wall's knots, larger at its two ends."""
@@ -179,9 +156,8 @@ class Vessel:
     def _limits(self) -> tuple[Limits, Int[np.ndarray, " points"]]:
         """Returns the limits of the inner wall at rest, and the nearest points of the outer one."""
         points, directions = self._inner.points, self._inner.directions
-        dense = np.linspace(0.0, self._outer.length, 8 * len(self._outer.at))
-        moved = Moved(self._outer.points, np.zeros((len(self._outer.points), 2, 0)))
-        outer = self._outer.piece(moved, dense, np.zeros((len(dense), 0))).points
+        end = self._rim[0] if self.interior_at_start.mouth else self._outer.length
+        dense, outer, _ = self._outer_at_rest(end)
         away, nearest = KDTree(outer).query(points)
         least = np.minimum(_LEAST_SHARE * away, _THINNEST * self.size)
         half = 0.5 * (points[:, 1].max() - points[:, 1].min())
@@ -203,18 +179,32 @@ class Vessel:
         return float(heights.min()) + margin, highest - margin
 
     def _find_rim(self) -> tuple[float, float]:
-        """Returns the lengths at which the outer and the inner wall end at the mouth."""
-        upright = np.flatnonzero(self._inner.directions[:, 0] > _UPRIGHT)
-        last = int(upright[-1]) if len(upright) else 0
-        radius = self._inner.points[last, 0]
-        high = self._outer.points[:, 1] > self._inner.points[last, 1]
-        wide = np.flatnonzero(high & (self._outer.points[:, 0] > radius))
-        if not len(wide) or wide[-1] + 1 >= len(self._outer.at):
+        """Returns the lengths at which the outer and the inner wall end at the mouth.
+
+        The inner wall ends just before it leaves the outer one.
+        """
+        lengths, points, normals = self._outer_at_rest(self._outer.length)
+        at = np.linspace(0.0, self._inner.length, 8 * len(self._inner.at))
+        inner = self._inner.piece(self._still(self._inner), at, np.zeros((len(at), 0))).points
+        nearest = KDTree(points).query(inner)[1]
+        height = np.sum((inner - points[nearest]) * normals[nearest], axis=-1)
+        high = inner[:, 1] > 0.5 * (inner[:, 1].min() + points[:, 1].max())
+        left = np.flatnonzero((height > -_RIM * self.interior_at_start.wall) & high)
+        last = left[0] - 1 if len(left) else 0
+        if last <= 0 or points[nearest[last], 0] <= _LEAST_GAP * self.size:
             raise ReconstructionError("The vessel has no mouth at its top. Pass mouth=False.")
-        (r, s), at = self._outer.points[wide[-1] : wide[-1] + 2, 0], self._outer.at
-        share = (r - radius) / max(r - s, 1e-12)
-        begin, end = at[wide[-1]], at[wide[-1] + 1]
-        return float(begin + share * (end - begin)), float(self._inner.at[last])
+        return float(lengths[nearest[last]]), float(at[last])
+
+    def _outer_at_rest(self, end: float) -> tuple[np.ndarray, Curve, Curve]:
+        """Returns lengths along the outer wall up to one, and its points and normals there."""
+        dense = np.linspace(0.0, end, 8 * len(self._outer.at))
+        found = self._outer.piece(self._still(self._outer), dense, np.zeros((len(dense), 0)))
+        return dense, found.points, found.normals
+
+    @staticmethod
+    def _still(wall: Wall) -> Moved:
+        """Returns a wall at rest, without unknowns."""
+        return Moved(wall.points, np.zeros((len(wall.points), 2, 0)))
 
     def _shares(self) -> list[Float[np.ndarray, " points"]]:
         """Returns where points are: shares of the outer wall, of the liquid's and of the air's."""
@@ -226,8 +216,9 @@ class Vessel:
         inner = self._inner
         count, cut = len(inner.at), inner.length
         if interior.level_unknown:
-            still = Moved(inner.points, np.zeros((count, 2, 0)))
-            cut, _ = inner.reach(still, float(np.clip(interior.level, *self._range)), np.zeros(0))
+            cut, _ = inner.reach(
+                self._still(inner), float(np.clip(interior.level, *self._range)), np.zeros(0)
+            )
             # The number of points below depends on the level at rest; that of all does not.
             count = int(np.clip(np.searchsorted(inner.at, cut), _FEWEST, count - _FEWEST))
         found.append(walls.shares(inner.at, 0.0, cut, count))
@@ -282,7 +273,8 @@ class Vessel:
         """Returns the vessel at given unknowns."""
         kinds = self._kinds()
         kinds += ["air"] * (_PARTS - len(kinds))
-        media = [self._media(x)[kind] for kind in kinds]
+        of_kinds = media_of(self.interior(x), self.layout)
+        media = [of_kinds[kind] for kind in kinds]
         interfaces = nested(
             [medium.index for medium in media],
             [NO_PARENT] + [0] * (len(media) - 1),
@@ -297,18 +289,6 @@ class Vessel:
             _selected([medium.absorption_at for medium in media], 3, len(x)),
         )
 
-    def _media(self, x: Float[np.ndarray, " unknowns"]) -> dict[str, _Medium]:
-        """Returns the materials at given unknowns, by their names."""
-        now, at, fixed = self.interior(x), self.layout, slice(0)
-        clear = NO_ABSORPTION
-        return {
-            "glass": _Medium(now.glass, now.glass_tint, clear, at.glass, at.glass_tint, fixed),
-            "liquid": _Medium(
-                now.liquid, now.tint, now.absorption, at.liquid, at.tint, at.absorption
-            ),
-            "air": _Medium(INDEX_OF_AIR, CLEAR, clear, fixed, fixed, fixed),
-        }
-
     def _kinds(self) -> list[str]:
         """Returns the material of each part."""
         interior = self.interior_at_start
@@ -318,20 +298,34 @@ class Vessel:
 
     def _surfaces(self, x: Float[np.ndarray, " unknowns"]) -> list[Posed]:
         """Returns the surfaces of the parts, with columns for all unknowns."""
-        zeros = len(x) - 4 - self.layout.profile
-        return [self._posed(outline, x, zeros) for outline in self._pieces(x)]
+        return [self._posed(outline, x) for outline in self._pieces(x)]
 
-    def _posed(self, outline: Outline, x: Float[np.ndarray, " unknowns"], zeros: int) -> Posed:
+    def _posed(self, outline: Outline, x: Float[np.ndarray, " unknowns"]) -> Posed:
         """Returns a profile turned around the axis, with columns for all unknowns."""
-        shift, azimuths = np.append(x[:4], 0.0), self.detail.azimuths
+        shift, azimuths, layout = np.append(x[:4], 0.0), self.detail.azimuths, self.layout
         connected = lathe(outline.poles, outline.segments, outline.ends, azimuths)
-        axis, relief = self.outer.axis, self.outer.relief
-        posed = place(outline.turned, connected, azimuths, axis, shift, relief=relief)
+        at, axis, raised = (outline.turned, connected, azimuths), self.outer.axis, self.outer.relief
+        unknown = layout.relief.stop > layout.relief.start
+        if raised is not None and unknown:
+            offsets = x[layout.relief].reshape(relief.KNOTS)
+            posed = place_raised(*at, axis, shift, raised, offsets)
+        else:
+            posed = place(*at, axis, shift, relief=raised)
+        last = 5 + layout.profile
+        zeros = layout.relief.start - last + 1
 
-        def columns(matrix: np.ndarray) -> np.ndarray:
+        def columns(matrix: Matrix) -> Matrix:
             # A shift along the axis is an offset of the profile.
-            nothing = np.zeros((len(matrix), zeros))
-            return np.concatenate([matrix[:, :4], matrix[:, 5:], nothing], axis=1)
+            nothing = np.zeros((matrix.shape[0], zeros))
+            if not unknown:
+                return np.concatenate([matrix[:, :4], matrix[:, 5:], nothing], axis=1)
+            kept = (
+                matrix[:, :4],
+                matrix[:, 5:last],
+                scipy.sparse.csr_array(nothing),
+                matrix[:, last:],
+            )
+            return scipy.sparse.hstack(kept).tocsr()
 
         return posed._replace(
             by_vertices=columns(posed.by_vertices), by_normals=columns(posed.by_normals)
@@ -420,7 +414,10 @@ class Vessel:
         """
         found: list[Solid] = []
         for name, part in zip(self._kinds(), self.pose(x).parts, strict=True):
-            medium, parent = self._media(x)[name], 0 if found else NO_PARENT
+            medium, parent = (
+                media_of(self.interior(x), self.layout)[name],
+                0 if found else NO_PARENT,
+            )
             found.append(
                 Solid(name, mesh_of(part), medium.index, parent, medium.tint, medium.absorption)
             )
@@ -444,11 +441,15 @@ class Vessel:
         precision = np.diag(deviations**-2.0)
         for where, bend in ((layout.outer, _BEND), (layout.inner, _INNER_BEND)):
             count = where.stop - where.start
+            if where == layout.outer and count > _KNOTS:
+                bend = _FINE_BEND
             if count:
                 bends = np.diff(np.eye(count), 2, axis=0)
                 if where == layout.outer:
                     bends /= np.maximum(self._looseness[:-2], self._looseness[2:])[:, None]
                 precision[where, where] += bends.T @ bends / (bend * size) ** 2
+        if layout.relief.stop > layout.relief.start:
+            precision[layout.relief, layout.relief] = relief.precision()
         return precision, precision @ self._away(x)
 
     def _deviations_of_media(self) -> list[tuple[slice, float]]:
@@ -475,6 +476,7 @@ class Vessel:
         found[layout.glass] = found[layout.liquid] = _INDEX_STEP
         found[layout.tint] = found[layout.glass_tint] = _TINT_STEP
         found[layout.absorption] = _ABSORPTION_STEP / size
+        found[layout.relief] = relief.LARGEST_STEP
         return found
 
 

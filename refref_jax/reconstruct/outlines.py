@@ -29,14 +29,13 @@ from scipy.special import expit
 
 from refref_jax.geometry.cameras import Projection, pixel_rays, project, projection_slopes
 from refref_jax.geometry.rays import Rays
-from refref_jax.geometry.triangle_meshes import unit_vectors
 from refref_jax.reconstruct import ReconstructionError
 from refref_jax.reconstruct.families import Revolution
 from refref_jax.reconstruct.gauss_newton import Candidate, Rows
 from refref_jax.reconstruct.masks import Views, sample_with_slope, signed_distances
-from refref_jax.reconstruct.relief import Relief
+from refref_jax.reconstruct.relief import Relief, fitted_to_outlines
 from refref_jax.reconstruct.revolution import Curve
-from refref_jax.reconstruct.shapes import Posed, Unknowns, tilt
+from refref_jax.reconstruct.shapes import Posed, Unknowns, edges_of, tilt, vertex_normals_of
 
 OUTLINE_DEVIATION = 0.3
 """Standard deviation of a signed distance, the unit of the errors of outlines, in pixels."""
@@ -48,20 +47,22 @@ _WRONG, _FURTHEST = 1.0, 3.0
 # Largest number of rim points per view: neighbours have the same error, so more add nothing.
 _POINTS = 100
 
-# Steps of the fit of a profile, and the standard deviation of the second differences of its knots,
-# as a share of the diameter: neighbouring points have errors that are alike.
-_ROUNDS, _BEND = 5, 0.001
+# Steps of the fit of a profile, fits of a relief before it, and the standard deviation of the
+# second differences of its knots, as a share of the size: neighbours have errors that are alike.
+_ROUNDS, _RELIEF_ROUNDS, _BEND = 5, 3, 0.001
 
 # Pixels that are nearer to an outline than this are fitted to, in pixels; one view in so many
 # judges; numbers of pixels; and the share of wrong ones below which there are no ridges.
-_BESIDE, _JUDGE_EVERY, _FITTED, _JUDGES, _FEW_WRONG = 1.8, 5, 16_000, 8_000, 0.015
+_BESIDE, _JUDGE_EVERY, _FITTED, _JUDGES, _FEW_WRONG = 1.8, 5, 24_000, 8_000, 0.015
 
 # Scale of the logistic function of a depth, in pixels, and share of the pixels that are wrong.
 _MASK_DEVIATION, _MISTAKES = 0.15, 0.02
 
-# Knots of a fine profile, scale of the second differences of its offsets as a share of the
-# diameter, largest number of steps, and a gain in the logarithm of the probability that ends them.
-_FINE_KNOTS, _FINE_BEND, _FINE_ROUNDS, _LEAST_GAIN = 200, 0.0002, 16, 2.0
+# Knots of a fine profile, scale of the changes of its second differences, as a share of the size,
+# most steps with each scale, and a gain in the logarithm of the probability that ends them.
+# Multiples of this scale, each with a scale of the logistic function of a depth, in pixels.
+_FINE_KNOTS, _FINE_BEND, _FINE_ROUNDS, _LEAST_GAIN = 200, 0.00003, 5, 2.0
+_SCALES = ((30.0, 0.15), (10.0, 0.15), (3.0, 0.1), (1.0, 0.05))
 
 # Damping of the first step, factor of those after it, and the largest one.
 _DAMPING, _DAMPING_STEP, _MOST_DAMPING = 0.1, 6.0, 100.0
@@ -137,8 +138,8 @@ class Outlines:
 
     def of_surface(self, part: Posed) -> Rows:
         """Returns the equations of the outline of a surface."""
-        normals = _vertex_normals(part)
-        edges, creases = _edges(part.faces), _creases(part) if self._creased else None
+        normals = vertex_normals_of(part)
+        edges, creases = edges_of(part.faces), _creases(part) if self._creased else None
         if creases is not None:  # the mean of normals on both sides of a crease says nothing
             edges = edges[~np.any(np.isin(edges, creases.edges), axis=1)]
         generator = np.random.default_rng(self._seed)
@@ -220,7 +221,10 @@ def fit_profile(
     outlines = Outlines(views, seed=seed)
     found = _fitted(outer.with_relief(None), outlines)
     if relief is not None:
-        raised = _fitted(found.with_relief(relief), outlines)
+        raised = outer
+        for _ in range(_RELIEF_ROUNDS):
+            relief = fitted_to_outlines(relief, raised.raised, outlines.of_surface)
+            raised = _fitted(raised.with_relief(relief), outlines)
         found = raised if _error(raised, outlines) < _BETTER * _error(found, outlines) else found
     fitted, judges = _pixels_beside(views, seed=seed)
     if not len(fitted.inside) or not len(judges.inside):  # of a single view
@@ -323,7 +327,8 @@ def _deepest(body: Revolution, x: Unknowns, rays: Rays) -> _Deepest:
         away = np.sum(normals[nearest] * (flat - points[nearest]), axis=-1)
         return -away.reshape(t.shape), nearest.reshape(t.shape)
 
-    t, half = _within(profile.points, origins, directions)
+    widest = 1.0 if body.relief is None else 1.0 + body.relief.factors.max()
+    t, half = _within(profile.points * [widest, 1.0], origins, directions)
     each = np.arange(len(t))
     for ticks in _TICKS:
         tried = t[:, None] + half[:, None] * ticks
@@ -380,16 +385,16 @@ def _depths_by_unknowns(
 
 
 def _surprises(
-    depths: Float[np.ndarray, " rays"], inside: Bool[np.ndarray, " rays"]
+    depths: Float[np.ndarray, " rays"], inside: Bool[np.ndarray, " rays"], deviation: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns minus the logarithm of the probability of each pixel's mask; slope and curvature.
 
     The probability that a pixel is in a mask is a logistic function of its depth; a small share of
     the pixels is wrong.
     """
-    logistic = expit(depths / _MASK_DEVIATION)
+    logistic = expit(depths / deviation)
     likely = _MISTAKES + (1.0 - 2.0 * _MISTAKES) * logistic
-    slope = (1.0 - 2.0 * _MISTAKES) * logistic * (1.0 - logistic) / _MASK_DEVIATION
+    slope = (1.0 - 2.0 * _MISTAKES) * logistic * (1.0 - logistic) / deviation
     of_mask = np.where(inside, likely, 1.0 - likely)
     return (
         -np.log(of_mask),
@@ -402,33 +407,45 @@ def _judged(body: Revolution, pixels: _Pixels) -> tuple[float, float]:
     """Returns the share of pixels on whose masks a body is wrong, and the mean of `_surprises`."""
     depths = _deepest(body, body.start(), pixels.rays).depths
     wrong = np.mean((depths > 0.0) != pixels.inside)
-    return float(wrong), float(np.mean(_surprises(depths, pixels.inside)[0]))
+    return float(wrong), float(np.mean(_surprises(depths, pixels.inside, _MASK_DEVIATION)[0]))
 
 
 def _fitted_to_pixels(body: Revolution, pixels: _Pixels) -> Revolution:
     """Fits a body to which pixels are in masks, by the rays through their centres.
 
-    Second differences of the offsets have a Cauchy distribution: few are large, at ridges and rims.
+    Profiles consist of straight lines and arcs: changes of their curvature have a Cauchy
+    distribution, whose scale becomes smaller.
     """
-    bends = np.zeros((len(body.bends()), 4 + body.knots))
-    bends[:, 4:] = body.bends() / (_FINE_BEND * body.size)
+    x = body.start()
+    for scale, deviation in _SCALES:
+        x = _descended(body, x, pixels, scale * _FINE_BEND * body.size, deviation)
+    return body.moved(x)
+
+
+def _descended(
+    body: Revolution, x: Unknowns, pixels: _Pixels, scale: float, deviation: float
+) -> Unknowns:
+    """Returns unknowns after steps with one scale of the changes of curvature, world units."""
+    rest, by_offsets = body.curvature_changes()
+    bends = np.zeros((len(rest), 4 + body.knots))
+    rest, bends[:, 4:] = rest / scale, by_offsets / scale
     loose, _ = body.prior(body.start(), bend=math.inf)
 
     def look(x: Unknowns) -> tuple[float, _Deepest]:
         deepest = _deepest(body, x, pixels.rays)
-        surprise = np.sum(_surprises(deepest.depths, pixels.inside)[0]) / pixels.share
-        prior = 0.5 * x @ loose @ x + np.sum(np.log1p((bends @ x) ** 2))
+        surprise = np.sum(_surprises(deepest.depths, pixels.inside, deviation)[0]) / pixels.share
+        prior = 0.5 * x @ loose @ x + np.sum(np.log1p((rest + bends @ x) ** 2))
         return float(surprise + prior), deepest
 
-    x, damping = body.start(), _DAMPING
+    damping = _DAMPING
     energy, deepest = look(x)
     for _ in range(_FINE_ROUNDS):
         rows = _depths_by_unknowns(body, x, deepest)
-        _, slopes, weights = _surprises(deepest.depths, pixels.inside)
-        robust = 2.0 / (1.0 + (bends @ x) ** 2)
-        precision = loose + (bends.T * robust) @ bends
-        matrix = (rows.T * weights) @ rows / pixels.share + precision
-        gradient = rows.T @ slopes / pixels.share + precision @ x
+        _, slopes, weights = _surprises(deepest.depths, pixels.inside, deviation)
+        ratio = rest + bends @ x
+        robust = 2.0 / (1.0 + ratio**2)
+        matrix = (rows.T * weights) @ rows / pixels.share + loose + (bends.T * robust) @ bends
+        gradient = rows.T @ slopes / pixels.share + loose @ x + bends.T @ (robust * ratio)
         gain = 0.0
         while gain <= 0.0 and damping < _MOST_DAMPING:
             step = np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), -gradient)
@@ -439,20 +456,7 @@ def _fitted_to_pixels(body: Revolution, pixels: _Pixels) -> Revolution:
             x, energy, deepest = x + step, lower, there
         if gain < _LEAST_GAIN:
             break
-    return body.moved(x)
-
-
-def _vertex_normals(part: Posed) -> Float[np.ndarray, "vertices 3"]:
-    """Returns the mean of the corner normals at each vertex."""
-    at, each = part.faces.ravel(), part.normals[part.normal_ids.ravel()]
-    sums = [np.bincount(at, each[:, axis], len(part.vertices)) for axis in range(3)]
-    return unit_vectors(np.stack(sums, axis=-1))
-
-
-def _edges(faces: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, "edges 2"]:
-    """Returns each edge of a closed mesh once."""
-    both = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    return both[both[:, 0] < both[:, 1]]
+    return x
 
 
 def _creases(part: Posed) -> _Creases:

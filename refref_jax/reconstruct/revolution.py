@@ -31,11 +31,8 @@ _CORRECTIONS = 3
 _CELLS = 300
 _SLICES = 3
 
-# Empty cells around a section.
-_MARGIN = 4
-
-# Pieces of each cut through a face.
-_PIECES = 4
+# Empty cells around a section, and pieces of each cut through a face.
+_MARGIN, _PIECES = 4, 4
 
 # Points of a profile while it is fitted, as a share of the diameter.
 _STEP = 1.0 / 600.0
@@ -44,6 +41,9 @@ _STEP = 1.0 / 600.0
 # between these shares of the diameter.
 _SMOOTHING = 6.0
 _LEAST_SMOOTHING, _MOST_SMOOTHING = 0.0035, 0.017
+
+# Smoothing of the curvature that decides where a profile has points and knots, in its even steps.
+_CURVATURE_STEPS = 4.0
 
 # Points of the mesh further from the profile than this share of the diameter do not correct it.
 _REACH = 0.05
@@ -478,3 +478,23 @@ def _corrected_axis(axis: Axis, match: _Match, size: float) -> Axis:
     turn, shift = np.clip(step[:2] / size, -0.1, 0.1), step[2:]
     direction = axis.frame @ [turn[1], -turn[0], 1.0]
     return Axis(axis.point + axis.frame[:, :2] @ shift, frame_along(direction))
+
+
+def profile_places(profile: Profile, count: int) -> tuple[Float[np.ndarray, " count"], float]:
+    """Returns lengths along a profile, half of them even and half where it turns; its length."""
+    length = lengths(profile.curve)
+    normals = profile_normals(profile)
+    if profile.closed:
+        normals = np.concatenate([normals, normals[:1]])
+    before, after = normals[:-1], normals[1:]
+    angle = np.arctan2(
+        before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0], np.sum(before * after, axis=-1)
+    )
+    mode = "wrap" if profile.closed else "reflect"
+    turn = np.abs(gaussian_filter1d(angle, _CURVATURE_STEPS, mode=mode))
+    turn = gaussian_filter1d(turn, _CURVATURE_STEPS, mode=mode)
+    share = np.diff(length) / length[-1] + turn / turn.sum()
+    total = np.concatenate([[0.0], np.cumsum(share)])
+    ticks = np.linspace(0.0, total[-1], count + profile.closed)
+    at = np.interp(ticks, total, length)
+    return at[:count], float(length[-1])

@@ -109,6 +109,19 @@ def mesh_of(posed: Posed) -> Mesh:
     return Mesh(posed.vertices, posed.faces, posed.normals[posed.normal_ids])
 
 
+def vertex_normals_of(part: Posed) -> Float[np.ndarray, "vertices 3"]:
+    """Returns the mean of the corner normals at each vertex."""
+    at, each = part.faces.ravel(), part.normals[part.normal_ids.ravel()]
+    sums = [np.bincount(at, each[:, axis], len(part.vertices)) for axis in range(3)]
+    return unit_vectors(np.stack(sums, axis=-1))
+
+
+def edges_of(faces: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, "edges 2"]:
+    """Returns each edge of a closed mesh once."""
+    both = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    return both[both[:, 0] < both[:, 1]]
+
+
 class Cloud(NamedTuple):
     """Samples of a surface.
 

@@ -6,12 +6,13 @@ square section. A dozen numbers describe each exactly, where a spline of many kn
 Source: ours.
 """
 
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.sparse import bsr_array, csr_array, hstack, kron
 
-from refref_jax.reconstruct.relief import Relief
+from refref_jax.reconstruct.relief import Offsets, Relief
 from refref_jax.reconstruct.revolution import Axis, Curve, Lathe, lathe, sweep
 from refref_jax.reconstruct.shapes import (
     LARGEST_STEP,
@@ -37,12 +38,11 @@ _ALONG_LINE, _ALONG_ARC, _AROUND = 4, 16, 160
 # Fillets fade into the bound of their straight pieces with this power.
 _POWER = 8
 
+# Derivatives below this share of the largest one are left out of sparse matrices.
+_NEGLIGIBLE = 1e-7
+
 # Step of central differences, as a share of the diameter.
 _DIFFERENCE = 1e-6
-
-
-# Points or directions in space, and their derivatives.
-_Swept: TypeAlias = tuple[np.ndarray, np.ndarray]
 
 
 class Turned(NamedTuple):
@@ -59,6 +59,13 @@ class Turned(NamedTuple):
     by_points: Float[np.ndarray, "points 2 m"]
     normals: Float[np.ndarray, "points 2"]
     by_normals: Float[np.ndarray, "points 2 m"]
+
+
+def without_unknowns(turned: Turned) -> Turned:
+    """Returns a profile that does not depend on unknowns."""
+    return turned._replace(
+        by_points=turned.by_points[..., :0], by_normals=turned.by_normals[..., :0]
+    )
 
 
 def place(
@@ -88,7 +95,9 @@ def place(
     directions = sweep(turned.normals, turned.by_normals, rotations[0], azimuths)
     if relief is not None:
         at_normals = _rows_at_normals(connected, len(directions[0]), azimuths)
-        points, directions = _raised(points, directions, at_normals, rotations[0], relief)
+        found = _raised(points[0], directions[0], at_normals, rotations[0], relief)
+        points = (found.points, found.by_points @ points[1])
+        directions = (found.normals, found.by_normals @ directions[1])
 
     def turn(swept: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         local = swept @ rotations[0]
@@ -109,6 +118,61 @@ def place(
     )
 
 
+def place_raised(
+    turned: Turned,
+    connected: Lathe,
+    azimuths: int,
+    axis: Axis,
+    pose: Float[np.ndarray, "5"],
+    relief: Relief,
+    offsets: Offsets,
+) -> Posed:
+    """Does what `place` does if offsets of the relief are unknowns as well, after all others.
+
+    Derivatives are sparse.
+    """
+    still, raising = without_unknowns(turned), relief.with_offsets(offsets)
+    posed = place(still, connected, azimuths, axis, pose, relief=raising)
+    frame, rows = axis.frame @ tilt(pose[:2])[0], connected.rows
+    points, normals = (
+        sweep(*of, frame, azimuths)[0]
+        for of in ((turned.points, still.by_points), (turned.normals, still.by_normals))
+    )
+    at_normals = _rows_at_normals(connected, len(normals), azimuths)
+    found = _raised(points, normals, at_normals, frame, raising)
+    raised = relief.slopes(points @ frame, normals @ frame, at_normals, offsets)
+    slopes = []
+    for by_itself, of_profile, by_relief, by_pose in (
+        (found.by_points, turned.by_points, raised[0], posed.by_vertices),
+        (found.by_normals, turned.by_normals, raised[1], posed.by_normals),
+    ):
+        rotation = np.broadcast_to(frame, by_itself.shape)
+        blocks = _block_diagonal(by_itself) @ _swept(of_profile, frame, azimuths)
+        more = hstack([blocks, _block_diagonal(rotation) @ by_relief]).tocsr()
+        if by_pose is posed.by_vertices:
+            more = more[(3 * rows[:, None] + np.arange(3)).ravel()]
+        slopes.append(hstack([csr_array(by_pose), more]).tocsr())
+    return posed._replace(by_vertices=slopes[0], by_normals=slopes[1])
+
+
+def _swept(slopes: Float[np.ndarray, "k 2 m"], frame: Frame, azimuths: int) -> csr_array:
+    """Returns the derivatives that `sweep` returns, `[3 k azimuths, m]`, as a sparse matrix."""
+    angle = 2.0 * np.pi / azimuths * np.arange(azimuths)
+    around = np.cos(angle)[:, None] * frame[:, 0] + np.sin(angle)[:, None] * frame[:, 1]
+    along = np.tile(frame[:, 2], azimuths)
+    least = _NEGLIGIBLE * np.abs(slopes).max(initial=0.0)
+    radial, axial = (
+        csr_array(np.where(np.abs(x) > least, x, 0.0)) for x in (slopes[:, 0], slopes[:, 1])
+    )
+    return (kron(radial, around.reshape(-1, 1)) + kron(axial, along[:, None])).tocsr()
+
+
+def _block_diagonal(blocks: Float[np.ndarray, "n 3 3"]) -> csr_array:
+    count = len(blocks)
+    entries = (blocks, np.arange(count), np.arange(count + 1))
+    return bsr_array(entries, shape=(3 * count, 3 * count)).tocsr()
+
+
 def _rows_at_normals(connected: Lathe, count: int, azimuths: int) -> Int[np.ndarray, " normals"]:
     """Returns the row of the swept points at which each normal is."""
     found = np.zeros(count, np.int64)
@@ -117,25 +181,34 @@ def _rows_at_normals(connected: Lathe, count: int, azimuths: int) -> Int[np.ndar
     return azimuths * (found // azimuths) + np.arange(count) % azimuths
 
 
+class _Raised(NamedTuple):
+    """Points and normals with a relief, and their derivatives by those without it.
+
+    That the stretching at a normal changes with the unknowns is left out.
+    """
+
+    points: Float[np.ndarray, "points 3"]
+    normals: Float[np.ndarray, "normals 3"]
+    by_points: Float[np.ndarray, "points 3 3"]
+    by_normals: Float[np.ndarray, "normals 3 3"]
+
+
 def _raised(
-    points: _Swept,
-    normals: _Swept,
+    points: Float[np.ndarray, "points 3"],
+    normals: Float[np.ndarray, "normals 3"],
     at_normals: Int[np.ndarray, " normals"],
     frame: Frame,
     relief: Relief,
-) -> tuple[_Swept, _Swept]:
-    """Returns points and normals with a relief; normals turn as those of a stretched surface.
-
-    That the stretching at a normal changes with the unknowns is left out of its derivatives.
-    """
-    stretched = relief.stretch(points[0] @ frame)
+) -> _Raised:
+    """Returns points and normals with a relief; normals turn as those of a stretched surface."""
+    stretched = relief.stretch(points @ frame)
     jacobian = frame @ stretched.jacobian @ frame.T
     turn = np.linalg.inv(jacobian)[at_normals].swapaxes(1, 2)
-    turned = np.einsum("nij,nj->ni", turn, normals[0])
+    turned = np.einsum("nij,nj->ni", turn, normals)
     length = np.linalg.norm(turned, axis=-1)[:, None]
-    unit, moved = turned / length, turn @ normals[1] / length[..., None]
-    moved -= unit[..., None] * np.sum(unit[..., None] * moved, axis=1)[:, None]
-    return (stretched.points @ frame.T, jacobian @ points[1]), (unit, moved)
+    unit, by_normals = turned / length, turn / length[..., None]
+    by_normals -= unit[..., None] * (unit[:, None] @ by_normals)
+    return _Raised(stretched.points @ frame.T, unit, jacobian, by_normals)
 
 
 def place_on_axis(

@@ -42,6 +42,12 @@ _SMOOTHING, _TURNS = 3.0, 4.0
 # Steepest slope of the bottom of a body, and share of its radius that a hollow takes.
 _LEVEL_SLOPE, _HOLLOW = 0.35, 0.92
 
+# Knots of a profile without ridges, their least height as a share of the diameter, and rounds.
+_BASE_KNOTS, _RIDGE, _RIDGE_ROUNDS = 36, 0.0005, 12
+
+FACING_UP = 0.6
+"""Least share of the normal along the axis where a wall has turned to the top of its object."""
+
 # Circles of a horizontal surface, with its rim and its middle.
 _RINGS = 4
 
@@ -397,6 +403,50 @@ def inset(
     points = gaussian_filter1d(loop, _SMOOTHING, axis=0, mode="wrap")[: len(points)]
     points[[0, -1], 0] = 0.0
     return Profile(points, closed=False)
+
+
+def with_open_top(profile: Profile, height: float) -> Profile:
+    """Returns a profile whose rim continues straight up, as that of a vessel before it was cut off.
+
+    Args:
+      profile: profile that begins and ends on the axis.
+      height: height of the added part, world units.
+    """
+    points = even(profile.points, _STEPS)
+    normals = profile_normals(Profile(points, closed=False))
+    last = int(np.flatnonzero(normals[:, 1] < FACING_UP)[-1])
+    rim, top = points[last, 0], points[:, 1].max() + height
+    added = np.array([[rim, top], [0.0, top]])
+    return Profile(np.concatenate([points[: last + 1], added]), closed=False)
+
+
+def without_ridges(profile: Profile, size: float) -> Profile:
+    """Returns a profile without narrow parts that stand out, such as rings and threads.
+
+    It is a spline of few knots that gives little weight to points outside of it.
+
+    Args:
+      profile: profile that begins and ends on the axis.
+      size: diameter of the object.
+    """
+    points = even(profile.points, _STEPS)
+    normals = profile_normals(Profile(points, closed=False))
+    length = lengths(points)
+    at = np.linspace(0.0, length[-1], _BASE_KNOTS)
+    one = np.eye(_BASE_KNOTS)
+    radii = CubicSpline(at, one[:, 1:-1], bc_type="natural")(length)  # zero at both ends
+    heights = CubicSpline(at, one, bc_type="clamped")(length)
+    weights = np.ones(len(points))
+    for _ in range(_RIDGE_ROUNDS):
+        fitted = [
+            matrix @ np.linalg.lstsq(weights[:, None] * matrix, weights * values, rcond=None)[0]
+            for matrix, values in zip((radii, heights), points.T, strict=True)
+        ]
+        found = np.stack(fitted, axis=-1)
+        above = np.sum((points - found) * normals, axis=-1) / (_RIDGE * size)
+        weights = 1.0 / np.hypot(1.0, np.maximum(above, 0.0))
+    found[[0, -1], 0] = 0.0
+    return Profile(found, closed=False)
 
 
 def with_punt(profile: Profile, height: float) -> Profile:

@@ -390,3 +390,19 @@ def test_an_inverted_mesh_is_refused(ball):
     for fit in (fit_sphere, fit_torus, fit_revolution, fit_polyhedron):
         with pytest.raises(ReconstructionError, match="inwards"):
             fit(bodies.inverted(ball))
+
+
+@pytest.mark.parametrize("name", ["line", "arc"])
+def test_curvature_does_not_change_along_lines_and_arcs(name):
+    angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 400)
+    ball = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    cone = np.array([(0.0, -1.0), (0.9, -1.0), (0.4, 1.0), (0.0, 1.0)])
+    profile = Profile(ball if name == "arc" else revolved.even(cone, 400), closed=False)
+    body = Revolution(Axis(np.zeros(3), np.eye(3)), profile, 2.0, knots=200)
+    changes, by_offsets = body.curvature_changes()
+    # The corners of the cone are where second differences change.
+    smooth = slice(20, -20) if name == "arc" else slice(80, 130)
+    assert np.abs(changes[smooth]).max() < 1e-6
+    assert name == "arc" or np.abs(changes).max() > 1e-3
+    wave = np.cos(np.pi * np.arange(200))
+    assert np.abs(by_offsets @ wave).min() == pytest.approx(8.0)

@@ -20,8 +20,8 @@ from refref_jax.reconstruct.interior_looks import SearchSettings, hypotheses, lo
 from refref_jax.reconstruct.interior_search import Few, _finding, _looked_again, _simplest
 from refref_jax.reconstruct.interiors import Vessel
 from refref_jax.reconstruct.mesh_distance import signed_distance
-from refref_jax.reconstruct.revolution import Profile
-from refref_jax.reconstruct.walls import inset, with_punt
+from refref_jax.reconstruct.revolution import Axis, Profile
+from refref_jax.reconstruct.walls import inset, with_open_top, with_punt, without_ridges
 from tests.factories import revolved, vessels
 from tests.laws import posed_surfaces
 
@@ -173,6 +173,53 @@ def test_a_punt_is_a_hollow_under_the_bottom_alone():
     np.testing.assert_array_equal(with_punt(profile, 0.0).points, profile.points)
     ball = np.stack([np.sin(np.linspace(0, np.pi, 99)), -np.cos(np.linspace(0, np.pi, 99))], -1)
     assert np.abs(with_punt(Profile(ball, closed=False), 0.1).points - ball).max() <= 0.1
+
+
+def _beaker(flare=0.3):
+    """A beaker whose lip flares out by as much as it is high."""
+    corners = [(0.0, -1.0), (0.5, -1.0), (0.5, 0.7), (0.5 + flare, 0.7 + flare), (0.0, 0.7 + flare)]
+    return Profile(revolved.even(np.array(corners), 600), closed=False)
+
+
+def test_the_rim_of_an_open_vessel_continues_straight_up():
+    found = with_open_top(_beaker(), 0.2).points
+    above = found[found[:, 1] > 1.01]
+    assert found[:, 1].max() == pytest.approx(1.2)
+    np.testing.assert_allclose(above[:-1, 0], 0.8, atol=0.01)
+    np.testing.assert_array_equal(found[-1], [0.0, found[:, 1].max()])
+    below = found[found[:, 1] < 0.9]
+    assert np.abs(np.interp(0.0, below[20:, 1], below[20:, 0]) - 0.5) < 1e-6
+
+
+def test_the_inner_wall_of_an_open_vessel_follows_a_flared_lip():
+    outer = Revolution(Axis(np.zeros(3), np.eye(3)), _beaker(), 2.0)
+    vessel = Vessel(outer, Interior("air", mouth=True, wall=0.08))
+    glass = vessel.solids(vessel.start())[0].mesh
+    radius = np.linalg.norm(glass.vertices[:, :2], axis=-1)
+    inside = (glass.vertices[:, 2] > 0.8) & (glass.vertices[:, 2] < 0.95)
+    inner = radius[inside] < glass.vertices[inside, 2] - 0.24  # nearer to the axis than the middle
+    thickness = glass.vertices[inside, 2] - 0.2 - radius[inside]
+    assert inner.any()
+    np.testing.assert_allclose(thickness[inner] / np.sqrt(2.0), 0.08, atol=0.025)
+
+
+def test_a_vessel_without_an_upper_side_has_no_mouth():
+    spindle = np.array([(0.0, -1.0), (0.3, 0.0), (0.0, 1.0)])
+    profile = Profile(revolved.even(spindle, 600), closed=False)
+    outer = Revolution(Axis(np.zeros(3), np.eye(3)), profile, 2.0)
+    with pytest.raises(ReconstructionError, match="mouth=False"):
+        Vessel(outer, Interior("air", mouth=True, wall=0.05))
+
+
+def test_rings_are_no_part_of_what_an_inner_wall_follows():
+    points = revolved.even(np.array([(0.0, -1.0), (0.5, -1.0), (0.5, 1.0), (0.0, 1.0)]), 600)
+    raised = points.copy()
+    for height in (-0.5, 0.0, 0.5):
+        on = (points[:, 0] > 0.499) & (np.abs(points[:, 1] - height) < 0.04)
+        raised[on, 0] += 0.03
+    found = without_ridges(Profile(raised, closed=False), 2.0).points
+    middle = np.abs(found[:, 1]) < 0.8
+    np.testing.assert_allclose(found[middle, 0], 0.5, atol=0.006)
 
 
 def test_what_can_not_be_a_vessel_is_refused(body):

@@ -10,13 +10,20 @@ from refref_jax.geometry.triangle_meshes import (
     make_mesh,
     unit_vectors,
 )
+from refref_jax.reconstruct import outlines as outlines_module
 from refref_jax.reconstruct.contents import Detail, Interior
 from refref_jax.reconstruct.families import Revolution, fit_revolution
 from refref_jax.reconstruct.interiors import Vessel
 from refref_jax.reconstruct.masks import Views
 from refref_jax.reconstruct.mesh_distance import signed_distance
-from refref_jax.reconstruct.outlines import fit_profile
-from refref_jax.reconstruct.relief import Relief, measure_relief
+from refref_jax.reconstruct.outlines import Outlines, fit_profile
+from refref_jax.reconstruct.relief import (
+    KNOTS,
+    Relief,
+    fitted_to_outlines,
+    measure_relief,
+    precision,
+)
 from refref_jax.reconstruct.revolution import Axis, Profile
 from tests.factories import bodies, revolved, vessels
 from tests.laws import posed_surfaces
@@ -149,6 +156,90 @@ def test_parts_of_a_vessel_with_a_relief_are_closed_and_nested(relief):
         np.testing.assert_array_equal(liquid.vertices[:, 2], plain.vertices[:, 2])
 
 
+@pytest.mark.parametrize("mouth", [False, True])
+def test_offsets_of_a_relief_move_all_parts_as_their_derivatives_say(relief, mouth):
+    body = vessels.bottle().with_relief(Relief(-1.0, 0.05, relief.factors))
+    detail = Detail(outer=48, ridges=0, inner=64, azimuths=48)
+    interior = Interior("liquid and air", mouth=mouth, wall=0.12, level=-0.2, gap=0.05)
+    vessel, generator = Vessel(body, interior, detail), np.random.default_rng(2)
+    where = vessel.layout.relief
+    assert where.stop - where.start == np.prod(KNOTS)
+    x, step = vessel.start(), np.zeros(vessel.layout.count)
+    x[where] = 0.01 * generator.normal(size=where.stop - where.start)
+    step[where] = 1e-6 * generator.normal(size=where.stop - where.start)
+    parts = [vessel.pose(each).parts for each in (x + step, x - step, x)]
+    for after, before, now in list(zip(*parts, strict=True))[: 2 if mouth else 3]:
+        moved = 0.5 * (after.vertices - before.vertices).ravel()
+        turned = 0.5 * (after.normals - before.normals).ravel()
+        assert np.abs(moved).max() > 1e-7
+        np.testing.assert_allclose(now.by_vertices @ step, moved, atol=1e-4 * np.abs(moved).max())
+        np.testing.assert_allclose(now.by_normals @ step, turned, atol=1e-4 * np.abs(turned).max())
+
+
+def test_other_unknowns_move_a_vessel_alike_with_and_without_offsets_of_its_relief(relief):
+    body = vessels.bottle().with_relief(Relief(-1.0, 0.05, relief.factors))
+    detail = Detail(outer=48, ridges=0, inner=64, azimuths=48)
+    with_offsets, without = (
+        Vessel(body, Interior(wall=0.12, level=-0.2), detail._replace(relief=unknown))
+        for unknown in (True, False)
+    )
+    count = without.layout.count
+    x = 0.01 * np.random.default_rng(3).normal(size=with_offsets.layout.count)
+    x[with_offsets.layout.relief] = 0.0
+    x = x + with_offsets.start()
+    pairs = zip(with_offsets.pose(x).parts, without.pose(x[:count]).parts, strict=True)
+    for one, other in pairs:
+        np.testing.assert_allclose(one.vertices, other.vertices, atol=1e-12)
+        for name in ("by_vertices", "by_normals"):
+            expected = getattr(other, name)
+            found = getattr(one, name).toarray()[:, :count]
+            np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
+
+
+def test_a_raised_relief_is_that_of_its_offsets(relief):
+    offsets = 0.02 * np.random.default_rng(4).normal(size=KNOTS)
+    points = np.random.default_rng(5).uniform(-0.8, 0.8, size=(200, 3))
+    found = relief.raised(offsets).stretch(points).points
+    np.testing.assert_allclose(
+        found, relief.with_offsets(offsets).stretch(points).points, atol=1e-4
+    )
+
+
+def test_the_precision_of_offsets_prefers_smooth_ones():
+    matrix = precision()
+    np.linalg.cholesky(matrix)
+    height, azimuth = np.meshgrid(np.arange(KNOTS[0]), np.arange(KNOTS[1]), indexing="ij")
+    smooth = np.cos(2.0 * np.pi * azimuth / KNOTS[1]).ravel()
+    rough = np.cos(np.pi * (azimuth + height)).ravel()
+    assert smooth @ matrix @ smooth < 0.1 * (rough @ matrix @ rough)
+
+
+def test_the_sides_of_a_block_become_flat_in_its_outlines():
+    half, cameras = 0.8, bodies.cameras_around(20, size=100, distance=4.0)
+    views = Views(bodies.masks_of(bodies.box, cameras, steps=120), cameras)
+    mesh = revolved.noisy(bodies.fine_box(half, spacing=0.05), 0.006)
+    relief = measure_relief(mesh, _UPRIGHT)
+    median = half / np.cos(np.pi / 8.0)
+    points = revolved.even(revolved.cylinder(radius=median, half=half), 200)
+    profile = Profile(points, closed=False)
+    body = Revolution(_UPRIGHT, profile, 2.0 * half).with_relief(relief)
+    outlines = Outlines(views, seed=0)
+    fitted = body.with_relief(fitted_to_outlines(relief, body.raised, outlines.of_surface))
+    wrong = []
+    for each in (body, fitted):
+        posed = each.pose(each.start())
+        corners = posed.vertices[posed.faces]
+        middle = corners.mean(axis=1)
+        side = (np.abs(middle[:, 2]) < 0.5) & (np.abs(middle[:, 1]) < 0.5) & (middle[:, 0] > 0.0)
+        normals = face_normals(corners[side])
+        wrong.append(np.degrees(np.arccos(np.clip(normals[:, 0], -1.0, 1.0))).mean())
+    assert wrong[1] < 1.0 and wrong[1] < 0.2 * wrong[0]
+    # Corners reach further from the axis than the profile.
+    assert (
+        outlines_module._judged(fitted, outlines_module._pixels_beside(views, seed=0)[1])[0] < 0.1
+    )
+
+
 @pytest.mark.slow
 def test_outlines_decide_about_the_relief():
     cameras = bodies.cameras_around(24, size=120, distance=3.0)
@@ -163,7 +254,7 @@ def test_outlines_decide_about_the_relief():
         for solid in (_ball_with_six_sides, lambda p: bodies.ball(p, radius=0.9))
     )
     found = [fit_profile(outer, six_sided, relief=each) for each in (None, relief)]
-    assert found[0].relief is None and found[1].relief is relief
+    assert found[0].relief is None and found[1].relief is not None
     wrong = []
     for body in found:
         vertices = body.pose(body.start()).vertices
