@@ -61,7 +61,7 @@ class SearchSettings:
       last: blurs of the further steps of the best findings.
       finest: those of the best finding alone, if its outer surface has narrow ridges or a relief.
       rays: number of pixels of a step of the few numbers.
-      last_rays: number of pixels of a step of all unknowns.
+      last_rays: number of pixels of a step of all unknowns; twice as many of the finest steps.
       rivals: hypotheses whose error is above that of the best by more than this factor are left
         out before all unknowns are fitted.
       close: the same factor before these further steps.
@@ -82,7 +82,7 @@ class SearchSettings:
     few: tuple[int, ...] = (3, 3, 3, 2, 2, 2, 1, 1, 1)
     all: tuple[int, ...] = (2, 2, 1, 1, 0, 0, 0)
     last: tuple[int, ...] = (1, 0, 0, 0, 0, 0, 0, 0, 0, 0)
-    finest: tuple[int, ...] = (0,) * 12
+    finest: tuple[int, ...] = (1, *((0,) * 15))
     rays: int = 8192
     last_rays: int = 16384
     rivals: float = 1.25

@@ -198,11 +198,13 @@ def search(
         findings[number] = last
     best = _simplest(findings)
     if settings.finest and outer.is_fine:
-        at = next(n for n, each in enumerate(findings) if each is best)
-        steps = settings.finest
-        findings[at] = best = _fitted(
-            best.vessel, best.x, surface, pixels, judges, settings, steps, outlines
+        at = next(number for number, each in enumerate(findings) if each is best)
+        many = dataclasses.replace(
+            settings, rays=2 * settings.rays, last_rays=2 * settings.last_rays
         )
+        vessel, x, steps = best.vessel, best.x, settings.finest
+        best = _fitted(vessel, x, surface, pixels, judges, many, steps, outlines)
+        findings[at] = best
         say(f"{best.name}: finest steps, error {best.error:.4f}")
     return Found(best, findings, looks)
 

@@ -29,13 +29,20 @@ from scipy.special import expit
 
 from refref_jax.geometry.cameras import Projection, pixel_rays, project, projection_slopes
 from refref_jax.geometry.rays import Rays
-from refref_jax.reconstruct import ReconstructionError
 from refref_jax.reconstruct.families import Revolution
 from refref_jax.reconstruct.gauss_newton import Candidate, Rows
 from refref_jax.reconstruct.masks import Views, sample_with_slope, signed_distances
 from refref_jax.reconstruct.relief import Relief, fitted_to_outlines
 from refref_jax.reconstruct.revolution import Curve
-from refref_jax.reconstruct.shapes import Posed, Unknowns, edges_of, tilt, vertex_normals_of
+from refref_jax.reconstruct.shapes import (
+    Creases,
+    Posed,
+    Unknowns,
+    creases_of,
+    edges_of,
+    tilt,
+    vertex_normals_of,
+)
 
 OUTLINE_DEVIATION = 0.3
 """Standard deviation of a signed distance, the unit of the errors of outlines, in pixels."""
@@ -71,8 +78,8 @@ _DAMPING, _DAMPING_STEP, _MOST_DAMPING = 0.1, 6.0, 100.0
 _PIECES, _AROUND = 3, 1.2
 _TICKS = (np.linspace(-1.0, 1.0, 41), np.linspace(-1.0, 1.0, 9), np.linspace(-1.0, 1.0, 9))
 
-# Cosine of the angle between normals at a crease, and points along it.
-_CREASE, _ALONG_CREASE = math.cos(math.radians(10.0)), 12
+# Points along a crease.
+_ALONG_CREASE = 12
 
 # Largest error of a body with a relief, as a share of that of the body without it.
 _BETTER = 0.95
@@ -90,18 +97,6 @@ class _Rim(NamedTuple):
     first: Int[np.ndarray, " points"]
     second: Int[np.ndarray, " points"]
     share: Float[np.ndarray, " points"]
-
-
-class _Creases(NamedTuple):
-    """Edges across which the shading normals jump.
-
-    Attributes:
-      edges: their vertices.
-      faces: the faces on both sides.
-    """
-
-    edges: Int[np.ndarray, "creases 2"]
-    faces: Int[np.ndarray, "creases 2"]
 
 
 class Outlines:
@@ -139,7 +134,7 @@ class Outlines:
     def of_surface(self, part: Posed) -> Rows:
         """Returns the equations of the outline of a surface."""
         normals = vertex_normals_of(part)
-        edges, creases = edges_of(part.faces), _creases(part) if self._creased else None
+        edges, creases = edges_of(part.faces), creases_of(part) if self._creased else None
         if creases is not None:  # the mean of normals on both sides of a crease says nothing
             edges = edges[~np.any(np.isin(edges, creases.edges), axis=1)]
         generator = np.random.default_rng(self._seed)
@@ -173,7 +168,7 @@ class Outlines:
         part: Posed,
         normals: Float[np.ndarray, "vertices 3"],
         edges: Int[np.ndarray, "edges 2"],
-        creases: "_Creases | None",
+        creases: "Creases | None",
         generator: np.random.Generator,
     ) -> tuple[Float[np.ndarray, " points"], scipy.sparse.csr_array]:
         """Returns errors and derivatives by the vertices of the rim of one view."""
@@ -219,14 +214,11 @@ def fit_profile(
       seed: seed of the draws of points and pixels.
     """
     outlines = Outlines(views, seed=seed)
+    fitted, judges = _pixels_beside(views, seed=seed)
     found = _fitted(outer.with_relief(None), outlines)
     if relief is not None:
-        raised = outer
-        for _ in range(_RELIEF_ROUNDS):
-            relief = fitted_to_outlines(relief, raised.raised, outlines.of_surface)
-            raised = _fitted(raised.with_relief(relief), outlines)
+        raised = _best_relief(outer, relief, outlines, judges)
         found = raised if _error(raised, outlines) < _BETTER * _error(found, outlines) else found
-    fitted, judges = _pixels_beside(views, seed=seed)
     if not len(fitted.inside) or not len(judges.inside):  # of a single view
         return found
     wrong, surprise = _judged(found, judges)
@@ -234,6 +226,20 @@ def fit_profile(
         return found
     fine = _fitted_to_pixels(found.with_knots(_FINE_KNOTS), fitted)
     return fine if _judged(fine, judges)[1] < _BETTER * surprise else found
+
+
+def _best_relief(
+    outer: Revolution, relief: Relief, outlines: Outlines, judges: "_Pixels"
+) -> Revolution:
+    """Returns a body with the relief, as given or fitted, that explains the judges best."""
+    found = [_fitted(outer.with_relief(relief), outlines)]
+    for number in range(_RELIEF_ROUNDS):
+        body = found[-1] if number else outer
+        relief = fitted_to_outlines(relief, body.raised, outlines.of_surface)
+        found.append(_fitted(body.with_relief(relief), outlines))
+    if not len(judges.inside):
+        return found[0]
+    return min(found, key=lambda each: _judged(each, judges)[1])
 
 
 def _fitted(outer: Revolution, outlines: Outlines) -> Revolution:
@@ -459,22 +465,7 @@ def _descended(
     return x
 
 
-def _creases(part: Posed) -> _Creases:
-    """Returns the edges of a closed mesh whose normals differ by more than 10 degrees."""
-    around = [0, 1, 1, 2, 2, 0]
-    both, ids = (x[:, around].reshape(-1, 2) for x in (part.faces, part.normal_ids))
-    turned = both[:, 0] > both[:, 1]
-    both[turned], ids[turned] = both[turned, ::-1], ids[turned, ::-1]
-    order = np.lexsort(both.T)
-    first, second = order[::2], order[1::2]
-    if not np.array_equal(both[first], both[second]):
-        raise ReconstructionError("A mesh is not closed, so its outlines are unknown. Close it.")
-    cosines = np.sum(part.normals[ids[first]] * part.normals[ids[second]], axis=-1)
-    sharp = np.any(cosines < _CREASE, axis=1)
-    return _Creases(both[first][sharp], np.stack([first, second], axis=-1)[sharp] // 3)
-
-
-def _crease_rim(part: Posed, creases: _Creases, camera: Float[np.ndarray, "3"]) -> _Rim:
+def _crease_rim(part: Posed, creases: Creases, camera: Float[np.ndarray, "3"]) -> _Rim:
     """Returns points of the creases with one face towards the camera and one away from it."""
     corners = part.vertices[part.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

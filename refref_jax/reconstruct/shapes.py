@@ -9,6 +9,7 @@ Sources: Max, Weights for Computing Vertex Normals from Facet Normals (1999), fo
 are exact if the vertices lie on a sphere. The derivatives and the priors are ours.
 """
 
+import math
 from typing import NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
@@ -55,6 +56,9 @@ _APART = 0.82
 
 # Robust weights 1 / (1 + (e / s)^2)^2 have s at this multiple of the median error.
 _ROBUST = 1.5
+
+# Cosine of the angle between normals at a crease.
+_CREASE = math.cos(math.radians(10.0))
 
 # Longest edge of a mesh that is sampled at its vertices, as a share of the diameter.
 _LONGEST = 0.04
@@ -120,6 +124,33 @@ def edges_of(faces: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, "edges 2"]:
     """Returns each edge of a closed mesh once."""
     both = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     return both[both[:, 0] < both[:, 1]]
+
+
+class Creases(NamedTuple):
+    """Edges across which the shading normals jump.
+
+    Attributes:
+      edges: their vertices.
+      faces: the faces on both sides.
+    """
+
+    edges: Int[np.ndarray, "creases 2"]
+    faces: Int[np.ndarray, "creases 2"]
+
+
+def creases_of(part: Posed) -> Creases:
+    """Returns the edges of a closed mesh whose normals differ by more than 10 degrees."""
+    around = [0, 1, 1, 2, 2, 0]
+    both, ids = (x[:, around].reshape(-1, 2) for x in (part.faces, part.normal_ids))
+    turned = both[:, 0] > both[:, 1]
+    both[turned], ids[turned] = both[turned, ::-1], ids[turned, ::-1]
+    order = np.lexsort(both.T)
+    first, second = order[::2], order[1::2]
+    if not np.array_equal(both[first], both[second]):
+        raise ReconstructionError("A mesh is not closed, so its outlines are unknown. Close it.")
+    cosines = np.sum(part.normals[ids[first]] * part.normals[ids[second]], axis=-1)
+    sharp = np.any(cosines < _CREASE, axis=1)
+    return Creases(both[first][sharp], np.stack([first, second], axis=-1)[sharp] // 3)
 
 
 class Cloud(NamedTuple):

@@ -43,7 +43,7 @@ _SMOOTHING, _TURNS = 3.0, 4.0
 _LEVEL_SLOPE, _HOLLOW = 0.35, 0.92
 
 # Knots of a profile without ridges, their least height as a share of the diameter, and rounds.
-_BASE_KNOTS, _RIDGE, _RIDGE_ROUNDS = 36, 0.0005, 12
+_BASE_KNOTS, _RIDGE, _RIDGE_ROUNDS = 24, 0.0005, 12
 
 FACING_UP = 0.6
 """Least share of the normal along the axis where a wall has turned to the top of its object."""
