@@ -215,7 +215,7 @@ def test_the_precision_of_offsets_prefers_smooth_ones():
 
 
 def test_the_sides_of_a_block_become_flat_in_its_outlines():
-    half, cameras = 0.8, bodies.cameras_around(20, size=100, distance=4.0)
+    half, cameras = 0.8, bodies.cameras_around(14, size=80, distance=4.0)
     views = Views(bodies.masks_of(bodies.box, cameras, steps=120), cameras)
     mesh = revolved.noisy(bodies.fine_box(half, spacing=0.05), 0.006)
     relief = measure_relief(mesh, _UPRIGHT)
