@@ -3,7 +3,8 @@
 Many vessels are turned only in part: a foot with six sides, a spout in a lip, flutes in a wall. A
 `Relief` stretches every horizontal section of space away from the axis, by a factor that depends on
 height and azimuth. It applies to all surfaces of a vessel, so that their profiles stay the unknowns
-of a fit, and walls keep their thickness.
+of a fit, and walls keep their thickness. A relief is measured in a mesh (`measure_relief`), fitted
+to the outlines of masks (`fitted_to_outlines`), and its offsets are unknowns of a fit to light.
 
 What this cannot represent: sections that a ray from the axis leaves more than once, such as those
 of handles; insides that are round where the outside is not, at the same height.
@@ -48,12 +49,8 @@ _OFFSET, _ALONG, _AROUND = 0.02, 0.003, 0.006
 # in each round; scale of the changes of curvature around the axis, and of second differences along
 # it; weight of both.
 _FINE_KNOTS, _FINE_OFFSET = (60, 96), 0.02
-_TURN, _SCALES, _RISE, _SHARE = (
-    0.05,
-    (100.0, 30.0, 10.0, 10.0, 3.0, 3.0, 1.0, 1.0, 1.0),
-    0.0005,
-    0.25,
-)
+_SCALES = (100.0, 30.0, 10.0, 10.0, 3.0, 3.0, 1.0, 1.0, 1.0)
+_TURN, _RISE, _SHARE = 0.05, 0.0005, 0.25
 
 # Azimuths that are repeated on both sides, so that a spline is periodic.
 _REPEATED = 8
