@@ -188,10 +188,9 @@ class Vessel:
         inner = self._inner.piece(self._still(self._inner), at, np.zeros((len(at), 0))).points
         nearest = KDTree(points).query(inner)[1]
         height = np.sum((inner - points[nearest]) * normals[nearest], axis=-1)
-        high = inner[:, 1] > 0.5 * (inner[:, 1].min() + points[:, 1].max())
-        left = np.flatnonzero((height > -_RIM * self.interior_at_start.wall) & high)
-        last = left[0] - 1 if len(left) else 0
-        if last <= 0 or points[nearest[last], 0] <= _LEAST_GAP * self.size:
+        inside = np.flatnonzero(height < -_RIM * self.interior_at_start.wall)
+        last = int(inside[-1]) if len(inside) else 0
+        if last in (0, len(at) - 1) or points[nearest[last], 0] <= _LEAST_GAP * self.size:
             raise ReconstructionError("The vessel has no mouth at its top. Pass mouth=False.")
         return float(lengths[nearest[last]]), float(at[last])
 
