@@ -155,7 +155,16 @@ class Solid:
 
 @dataclasses.dataclass(frozen=True)
 class Medium:
-    """A material of a vessel, and where its unknowns are."""
+    """A material of a vessel, and where its unknowns are.
+
+    Attributes:
+      index: index of refraction.
+      tint: factor on light at each crossing of its surface, linear RGB.
+      absorption: absorption inside, linear RGB, per world unit.
+      index_at: place of the index in the unknowns; empty if it is fixed.
+      tint_at: the same of the logarithm of the tint.
+      absorption_at: the same of the absorption.
+    """
 
     index: float
     tint: Colour

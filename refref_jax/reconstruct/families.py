@@ -20,7 +20,7 @@ from trimesh.creation import icosphere
 
 from refref_jax.geometry.triangle_meshes import Mesh, diameter
 from refref_jax.reconstruct.polyhedra import fit_polyhedron
-from refref_jax.reconstruct.relief import Offsets, Relief
+from refref_jax.reconstruct.relief import Offsets, Relief, bends_around
 from refref_jax.reconstruct.revolution import (
     Axis,
     Curve,
@@ -295,10 +295,7 @@ class Revolution:
 
     def bends(self) -> Float[np.ndarray, "bends knots"]:
         """Returns the second differences of neighbouring offsets, one in each row."""
-        one = np.eye(self.knots)
-        if self.closed:
-            return np.roll(one, 1, axis=0) - 2.0 * one + np.roll(one, -1, axis=0)
-        return np.diff(one, 2, axis=0)
+        return bends_around(self.knots) if self.closed else np.diff(np.eye(self.knots), 2, axis=0)
 
     def curvature_changes(
         self,

@@ -59,7 +59,7 @@ class SearchSettings:
       few: blurs of the steps of the few numbers of a hypothesis.
       all: blurs of the steps of all unknowns, of each kind.
       last: blurs of the further steps of the best findings.
-      finest: those of the best finding alone, if its outer surface has narrow ridges or a relief.
+      finest: blurs of the final steps of the best finding, if its outside has ridges or a relief.
       rays: number of pixels of a step of the few numbers.
       last_rays: number of pixels of a step of all unknowns; twice as many of the finest steps.
       rivals: hypotheses whose error is above that of the best by more than this factor are left

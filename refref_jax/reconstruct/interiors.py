@@ -412,11 +412,9 @@ class Vessel:
         The part `glass` contains the others.
         """
         found: list[Solid] = []
+        media = media_of(self.interior(x), self.layout)
         for name, part in zip(self._kinds(), self.pose(x).parts, strict=True):
-            medium, parent = (
-                media_of(self.interior(x), self.layout)[name],
-                0 if found else NO_PARENT,
-            )
+            medium, parent = media[name], 0 if found else NO_PARENT
             found.append(
                 Solid(name, mesh_of(part), medium.index, parent, medium.tint, medium.absorption)
             )

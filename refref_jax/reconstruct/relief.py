@@ -128,13 +128,14 @@ class Relief:
     def stretch(self, points: Float[np.ndarray, "points 3"]) -> Stretched:
         """Stretches points in the frame of the axis, and returns the derivatives."""
         height, azimuth = self._place(points)
-        factor = 1.0 + self._spline.ev(height, azimuth)
+        factor = self._factor(points)
         by_height = self._spline.ev(height, azimuth, dx=1) * (height == points[:, 2])
         by_azimuth = self._spline.ev(height, azimuth, dy=1)
         if self._offsets is not None:
-            more = self._hats(points, self._offsets).sum(self._offsets)
-            factor = factor + more[0]
-            by_height, by_azimuth = by_height + more[1], by_azimuth + more[2]
+            _, more_by_height, more_by_azimuth = self._hats(points, self._offsets).sum(
+                self._offsets
+            )
+            by_height, by_azimuth = by_height + more_by_height, by_azimuth + more_by_azimuth
         flat = points * [1.0, 1.0, 0.0]
         square = np.maximum(np.sum(flat**2, axis=-1), 1e-300)
         around = np.stack([-points[:, 1], points[:, 0], np.zeros(len(points))], axis=-1)
@@ -145,7 +146,7 @@ class Relief:
 
     def shrink(self, points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points 3"]:
         """Inverts `stretch`."""
-        factor = 1.0 + self._spline.ev(*self._place(points))
+        factor = self._factor(points)
         return points / np.stack([factor, factor, np.ones_like(factor)], axis=-1)
 
     def at_knots(self, knots: tuple[int, int]) -> Offsets:
@@ -229,6 +230,14 @@ class Relief:
         at = (azimuths * rows[:, :, None] + columns[:, None, :]).reshape(len(points), 16)
         return _Hats(at, both(along, around), both(rise, around), both(along, swing / turn))
 
+    def _factor(self, points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, " points"]:
+        """Returns the factor at points, with its offsets."""
+        found: np.ndarray = 1.0 + self._spline.ev(*self._place(points))
+        if self._offsets is None:
+            return found
+        more: np.ndarray = self._hats(points, self._offsets).sum(self._offsets)[0]
+        return found + more
+
     def _place(self, points: Float[np.ndarray, "points 3"]) -> tuple[np.ndarray, np.ndarray]:
         """Returns heights, within those of the relief, and azimuths."""
         height = np.clip(points[:, 2], self.low, self._high)
@@ -259,10 +268,7 @@ def _cubic(
 def precision() -> Float[np.ndarray, "unknowns unknowns"]:
     """Returns the precision matrix of the unknowns: small offsets, and smaller bends."""
     heights, azimuths = (np.eye(count) for count in KNOTS)
-    along = np.diff(heights, 2, axis=0) / _ALONG
-    around = (
-        np.roll(azimuths, 1, axis=0) - 2.0 * azimuths + np.roll(azimuths, -1, axis=0)
-    ) / _AROUND
+    along, around = np.diff(heights, 2, axis=0) / _ALONG, bends_around(KNOTS[1]) / _AROUND
     found: np.ndarray = np.kron(along.T @ along, azimuths) + np.kron(heights, around.T @ around)
     return found + np.eye(len(found)) / _OFFSET**2
 
@@ -308,7 +314,7 @@ def _differences(factors: Offsets) -> list[tuple[np.ndarray, csr_array, float]]:
     """
     heights, azimuths = factors.shape
     turn, one = 2.0 * np.pi / azimuths, np.eye(azimuths)
-    curvature = _bends_around(azimuths) / turn**2 + one
+    curvature = bends_around(azimuths) / turn**2 + one
     change = csr_array(np.roll(curvature, -1, axis=0) - curvature)
     around = kron(eye_array(heights), change).tocsr()
     inverse = 1.0 / factors.ravel()
@@ -319,7 +325,7 @@ def _differences(factors: Offsets) -> list[tuple[np.ndarray, csr_array, float]]:
     ]
 
 
-def _bends_around(count: int) -> Float[np.ndarray, "n n"]:
+def bends_around(count: int) -> Float[np.ndarray, "n n"]:
     """Returns the second differences of periodic values, one in each row."""
     one = np.eye(count)
     return np.roll(one, 1, axis=0) - 2.0 * one + np.roll(one, -1, axis=0)
@@ -343,13 +349,13 @@ def measure_relief(mesh: Mesh, axis: Axis) -> Relief | None:
         return None
     nearest = known[np.argmin(np.abs(np.arange(len(radii))[:, None] - known), axis=1)]
     radii = radii[nearest]
-    mean = np.median(radii, axis=1, keepdims=True)
+    middle = np.median(radii, axis=1, keepdims=True)
     # Along the normal: where a surface is nearly level, small errors move its radius by much.
-    rise = np.gradient(mean[:, 0], step)[:, None]
+    rise = np.gradient(middle[:, 0], step)[:, None]
     spread = radii.std(axis=1, keepdims=True) / np.hypot(1.0, rise)
     noise = _NOISE * diameter(mesh.vertices)
     kept = np.maximum(1.0 - (noise / np.maximum(spread, 1e-300)) ** 2, 0.0)
-    factors = gaussian_filter1d(kept * (radii / mean - 1.0), _SMOOTHING, axis=0, mode="nearest")
+    factors = gaussian_filter1d(kept * (radii / middle - 1.0), _SMOOTHING, axis=0, mode="nearest")
     return Relief(low, step, factors) if factors.any() else None
 
 

@@ -157,14 +157,12 @@ def place_raised(
 
 def _swept(slopes: Float[np.ndarray, "k 2 m"], frame: Frame, azimuths: int) -> csr_array:
     """Returns the derivatives that `sweep` returns, `[3 k azimuths, m]`, as a sparse matrix."""
-    angle = 2.0 * np.pi / azimuths * np.arange(azimuths)
-    around = np.cos(angle)[:, None] * frame[:, 0] + np.sin(angle)[:, None] * frame[:, 1]
-    along = np.tile(frame[:, 2], azimuths)
+    around, along = np.split(sweep(np.eye(2), np.zeros((2, 2, 0)), frame, azimuths)[0], 2)
     least = _NEGLIGIBLE * np.abs(slopes).max(initial=0.0)
     radial, axial = (
         csr_array(np.where(np.abs(x) > least, x, 0.0)) for x in (slopes[:, 0], slopes[:, 1])
     )
-    return (kron(radial, around.reshape(-1, 1)) + kron(axial, along[:, None])).tocsr()
+    return (kron(radial, around.reshape(-1, 1)) + kron(axial, along.reshape(-1, 1))).tocsr()
 
 
 def _block_diagonal(blocks: Float[np.ndarray, "n 3 3"]) -> csr_array:

@@ -45,8 +45,8 @@ _LEVEL_SLOPE, _HOLLOW = 0.35, 0.92
 # Knots of a profile without ridges, their least height as a share of the diameter, and rounds.
 _BASE_KNOTS, _RIDGE, _RIDGE_ROUNDS = 24, 0.0005, 12
 
-FACING_UP = 0.6
-"""Least share of the normal along the axis where a wall has turned to the top of its object."""
+# Least share of the normal along the axis where a wall has turned to the top of its object.
+_FACING_UP = 0.6
 
 # Circles of a horizontal surface, with its rim and its middle.
 _RINGS = 4
@@ -414,7 +414,7 @@ def with_open_top(profile: Profile, height: float) -> Profile:
     """
     points = even(profile.points, _STEPS)
     normals = profile_normals(Profile(points, closed=False))
-    last = int(np.flatnonzero(normals[:, 1] < FACING_UP)[-1])
+    last = int(np.flatnonzero(normals[:, 1] < _FACING_UP)[-1])
     rim, top = points[last, 0], points[:, 1].max() + height
     added = np.array([[rim, top], [0.0, top]])
     return Profile(np.concatenate([points[: last + 1], added]), closed=False)

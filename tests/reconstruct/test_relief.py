@@ -205,6 +205,23 @@ def test_a_raised_relief_is_that_of_its_offsets(relief):
     )
 
 
+def test_shrinking_inverts_stretching_with_offsets_too(relief):
+    offset = relief.with_offsets(0.02 * np.random.default_rng(6).normal(size=KNOTS))
+    points = np.random.default_rng(7).uniform(-0.8, 0.8, size=(200, 3))
+    np.testing.assert_allclose(offset.shrink(offset.stretch(points).points), points, atol=1e-12)
+
+
+def test_slopes_by_offsets_stay_finite_on_the_axis_and_beyond_both_ends(relief):
+    points = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -50.0], [1e-300, 0.0, 9.0], [1e6, 0.0, 0.0]])
+    normals = np.tile([0.0, 0.0, 1.0], (4, 1))
+    offsets = 0.02 * np.random.default_rng(8).normal(size=KNOTS)
+    for slopes in relief.slopes(points, normals, np.arange(4), offsets):
+        assert np.isfinite(slopes.data).all()
+    by_points, _ = relief.slopes(points, normals, np.arange(4), offsets)
+    assert not by_points[:6].toarray().any(), "points on the axis stay there"
+    np.testing.assert_allclose(by_points[9].sum(), 1e6)  # the splines sum to 1
+
+
 def test_the_precision_of_offsets_prefers_smooth_ones():
     matrix = precision()
     np.linalg.cholesky(matrix)
