@@ -300,13 +300,32 @@ def _bounds(
     return found
 
 
+class Division(NamedTuple):
+    """How faces are divided among the nodes of a tree.
+
+    Attributes:
+      levels: levels of the tree, from the root down.
+      order: faces in leaf order.
+    """
+
+    levels: list[Level]
+    order: Int[np.ndarray, " faces"]
+
+
+def divide(triangles: Float[np.ndarray, "faces 3 3"]) -> Division:
+    """Divides the faces of a triangle soup, of at least one, among the nodes of a tree."""
+    return Division(*_split_all(triangles.min(axis=1), triangles.max(axis=1)))
+
+
 def build(
-    triangles: Float[np.ndarray, "faces 3 3"],
+    triangles: Float[np.ndarray, "faces 3 3"], *, division: Division | None = None
 ) -> tuple[BVH, Int[np.ndarray, " primitives"]]:
     """Builds the tree of a triangle soup.
 
     Args:
       triangles: corners, world units, finite. May be empty, degenerate or duplicate.
+      division: division of the same faces at other places, such as those of a mesh that has moved
+        a little since. It takes most of the time, and is found by default.
 
     Returns:
       The tree, with triangles in leaf order, and the face of each primitive (the padding repeats
@@ -323,7 +342,7 @@ def build(
     if len(triangles) == 0:
         return _empty(triangles.dtype), np.zeros(LEAF_SIZE, np.int32)
     lower, upper = triangles.min(axis=1), triangles.max(axis=1)
-    levels, order = _split_all(lower, upper)
+    levels, order = division or divide(triangles)
     primitive_ids = np.concatenate([order, np.repeat(order[-1], LEAF_SIZE)])
     nodes = pack_nodes(levels, lower[order], upper[order])
     facets = prepare_facets(triangles[primitive_ids])

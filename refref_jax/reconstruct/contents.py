@@ -25,20 +25,20 @@ class Detail(NamedTuple):
       ridges: points that are added there if the wall has narrow ridges (`Revolution.knots`).
       inner: points along the inner wall, all of its pieces together.
       azimuths: number of half-planes.
-      relief: whether offsets of a relief are unknowns, if there is one.
+      fine: whether ridges have knots of their own, and offsets of a relief are unknowns.
     """
 
     outer: int = 112
     ridges: int = 128
     inner: int = 124
     azimuths: int = 96
-    relief: bool = True
+    fine: bool = True
 
 
 FINE = Detail()
 """Enough for photographs of 200 x 200 pixels."""
 
-COARSE = Detail(outer=72, ridges=0, inner=80, azimuths=64, relief=False)
+COARSE = Detail(outer=72, ridges=0, inner=80, azimuths=64, fine=False)
 """Enough for a look through a blurred backdrop."""
 
 

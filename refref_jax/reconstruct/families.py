@@ -45,6 +45,7 @@ from refref_jax.reconstruct.shapes import (
     Unknowns,
     cloud_of,
     independent_prior,
+    mesh_of,
     rms,
     robust_weights,
     tilt,
@@ -251,6 +252,12 @@ class Revolution:
         return place_on_axis(
             turned, self._lathe, _AROUND_AXIS, self.axis, unknowns[:4], relief=self.relief
         )
+
+    def mesh(self) -> Mesh:
+        """Returns the body at rest."""
+        turned, pose = without_unknowns(self.profile(self.start())), np.zeros(5)
+        at = (turned, self._lathe, _AROUND_AXIS, self.axis, pose)
+        return mesh_of(place(*at, relief=self.relief))
 
     def raised(self, relief: Relief, offsets: Offsets) -> Posed:
         """Returns the body with a relief and offsets of it, which are its last unknowns."""

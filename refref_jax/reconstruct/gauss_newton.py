@@ -193,14 +193,15 @@ class Equations(NamedTuple):
     of_pixels: Float[np.ndarray, "unknowns unknowns"]
 
 
-def traced_object(candidate: Candidate) -> TracedObject:
-    """Returns the scene of a candidate, on the device."""
+def traced_object(candidate: Candidate, *, like: TracedObject | None = None) -> TracedObject:
+    """Returns the scene of a candidate, on the device, faster with one of the same faces."""
     parts = candidate.parts
     return photometry.assemble(
         np.concatenate([part.vertices[part.faces] for part in parts]),
         np.concatenate([part.normals[part.normal_ids] for part in parts]),
         np.repeat(np.arange(len(parts)), [len(part.faces) for part in parts]),
         candidate.interfaces,
+        like=like,
     )
 
 
@@ -247,26 +248,22 @@ def fit(
         raise ReconstructionError("No pixel sees the object. Check the masks and the cameras.")
     generator = np.random.default_rng(settings.seed)
     draw = functools.partial(pixels.drawn, generator)
-    damping, facts = 1e-3, []
+    damping, facts, now = 1e-3, [], _place(model, x, None)
     for number, blur in enumerate(settings.blurs):
         seen = photometry.blurred(surface, blur)
-        candidate = model.pose(x)
-        traced = traced_object(candidate)
         wide = settings.widest * _NARROWING**number
         drawn = draw(settings.rays)
-        light = linearise(candidate, traced, seen, drawn, settings, least_scale=wide)
+        light = linearise(now.candidate, now.traced, seen, drawn, settings, least_scale=wide)
         if outlines is not None:
-            light = _with_rows(light, outlines(candidate))
-        x, damping, fact = _step(
-            model, x, traced, light, seen, draw(settings.judges), damping, blur
-        )
+            light = _with_rows(light, outlines(now.candidate))
+        now, damping, fact = _step(model, now, light, seen, draw(settings.judges), damping, blur)
         facts.append(fact)
         if progress is not None:
             progress(number + 1, fact)
         if _has_ended(facts, settings):
             break
-    precision, _ = model.prior(x)
-    return Fit(x, _covariance(light, precision), tuple(facts))
+    precision, _ = model.prior(now.x)
+    return Fit(now.x, _covariance(light, precision), tuple(facts))
 
 
 def _has_ended(facts: Sequence[StepFacts], settings: Steps) -> bool:
@@ -278,54 +275,55 @@ def _has_ended(facts: Sequence[StepFacts], settings: Steps) -> bool:
     return settings.gain > 0.0 and len(slow) > 1 and all(slow[-2:])
 
 
+class _Place(NamedTuple):
+    """Unknowns, and the scene that they give."""
+
+    x: Float[np.ndarray, " unknowns"]
+    candidate: Candidate
+    traced: TracedObject
+
+
+def _place(model: Model, x: Float[np.ndarray, " unknowns"], like: TracedObject | None) -> _Place:
+    candidate = model.pose(x)
+    return _Place(x, candidate, traced_object(candidate, like=like))
+
+
 def _step(
     model: Model,
-    x: Float[np.ndarray, " unknowns"],
-    traced: TracedObject,
+    now: _Place,
     light: Equations,
     surface: Backdrop,
     judges: Photographs,
     damping: float,
     blur: int,
-) -> tuple[Float[np.ndarray, " unknowns"], float, StepFacts]:
+) -> tuple[_Place, float, StepFacts]:
     """Tries steps of growing damping until one explains the judges better."""
-    precision, pull = model.prior(x)
+    precision, pull = model.prior(now.x)
     matrix, gradient = light.matrix + precision, light.gradient + pull
     scales = model.scales()
-    before = float(errors_of(traced, surface, judges).mean())
-    error = lambda y: float(errors_of(traced_object(model.pose(y)), surface, judges).mean())  # noqa: E731
+    before = float(errors_of(now.traced, surface, judges).mean())
+
+    def after(change: Float[np.ndarray, " unknowns"]) -> tuple[float, _Place]:
+        there = _place(model, now.x + change, now.traced)
+        return float(errors_of(there.traced, surface, judges).mean()), there
+
     for _ in range(3):
         damped = matrix + damping * np.diag(np.diag(light.matrix) + np.diag(precision))
         change = -scipy.linalg.solve(damped, gradient, assume_a="pos")
         change *= min(1.0, 1.0 / max(float(np.max(np.abs(change) / scales)), 1e-12))
-        after = error(x + change)
-        if after < before:
-            change, after = _further(x, change, after, scales, error)
+        error, there = after(change)
+        # Far from the solution, slopes promise too little: steps are doubled as long as that helps.
+        while error < before and float(np.max(np.abs(change) / scales)) < 0.5:
+            further = after(2.0 * change)
+            if further[0] >= error:
+                break
+            change, (error, there) = 2.0 * change, further
         rms = float(np.sqrt(np.mean((change / scales) ** 2)))
-        if after < before:
-            return (
-                x + change,
-                max(0.1 * damping, 1e-6),
-                StepFacts(blur, before, after, damping, True, rms),
-            )
+        if error < before:
+            facts = StepFacts(blur, before, error, damping, True, rms)
+            return there, max(0.1 * damping, 1e-6), facts
         damping = max(10.0 * damping, 1e-2)
-    return x, damping, StepFacts(blur, before, after, damping, False, rms)
-
-
-def _further(
-    x: Float[np.ndarray, " unknowns"],
-    change: Float[np.ndarray, " unknowns"],
-    after: float,
-    scales: Float[np.ndarray, " unknowns"],
-    error: Callable[[Float[np.ndarray, " unknowns"]], float],
-) -> tuple[Float[np.ndarray, " unknowns"], float]:
-    """Doubles a step as long as that helps: far from the solution, slopes promise too little."""
-    while float(np.max(np.abs(change) / scales)) < 0.5:
-        tried = error(x + 2.0 * change)
-        if tried >= after:
-            break
-        change, after = 2.0 * change, tried
-    return change, after
+    return now, damping, StepFacts(blur, before, error, damping, False, rms)
 
 
 def _with_rows(light: Equations, rows: Rows) -> Equations:
@@ -376,18 +374,18 @@ def linearise(
     if candidate.by_absorptions is not None:
         jacobian = jacobian - _by_channels(light, found.lengths) @ candidate.by_absorptions
     weights *= _without_largest(jacobian, weights, settings.outliers)[:, None]
-    jacobian = _dense(jacobian, least=_FULL)
     flat = weights.reshape(-1)
-    weighted = scipy.sparse.diags_array(flat) @ jacobian
+    root = scipy.sparse.diags_array(np.sqrt(flat))
+    weighted = _dense(root @ jacobian, least=_FULL)
     squared = float(np.sum(flat * error.reshape(-1) ** 2) / max(np.sum(flat), 1.0))
-    matrix = _dense(jacobian.T @ weighted)
+    matrix = _dense(weighted.T @ weighted)
     scale = max(squared, _LEAST_NOISE**2)
     names, views = np.unique(pixels.views, return_inverse=True)
     each = scipy.sparse.csr_array(
         (error.reshape(-1) / scale, (np.repeat(views, 3), np.arange(error.size))),
         shape=(len(names), error.size),
     )
-    by_view = _dense(each @ weighted)
+    by_view = _dense(each @ root @ weighted)
     return Equations(matrix / scale, by_view.sum(axis=0), by_view, matrix / scale)
 
 

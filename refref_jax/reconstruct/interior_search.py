@@ -45,8 +45,9 @@ _OUTLIERS = 0.02
 # blur of these looks.
 _SHIFTS = (0.03, -0.03, 0.05, -0.05, 0.08, -0.08, 0.12, -0.12)
 _GAPS = (0.002, 0.008, 0.02, 0.04, 0.07, 0.1)
-_BASES = (0.03, 0.05, 0.07, 0.1, 0.14, 0.2, 0.28, 0.36, 0.45, 0.55)
-_LIDS, _PUNTS = (0.03, 0.05, 0.08, 0.12, 0.17, 0.24), (0.006, 0.012, 0.02, 0.03, 0.045)
+_BASES = (0.03, 0.05, 0.07, 0.1, 0.14, 0.2, 0.28, 0.36, 0.45, 0.55, 0.7, 0.85)
+_LIDS = (0.03, 0.05, 0.08, 0.12, 0.17, 0.24, 0.33, 0.45)
+_PUNTS = (0.006, 0.012, 0.02, 0.03, 0.045)
 _BLUR = 2
 
 
@@ -185,7 +186,7 @@ def search(
     rivals = _best_of_kinds(rough, settings)
     again = _looked_again(outer, rivals, surface, pixels, settings)
     for interior in again or [each.vessel.interior_at_start for each in rivals]:
-        vessel = Vessel(outer, interior, detail)
+        vessel = Vessel(outer, interior, detail._replace(fine=False))
         start, steps = vessel.start(), settings.all
         fitted = _fitted(vessel, start, surface, pixels, judges, settings, steps, outlines)
         findings.append(fitted)
@@ -202,11 +203,32 @@ def search(
         many = dataclasses.replace(
             settings, rays=2 * settings.rays, last_rays=2 * settings.last_rays
         )
-        vessel, x, steps = best.vessel, best.x, settings.finest
+        (vessel, x), steps = refined(best.vessel, best.x, detail), settings.finest
         best = _fitted(vessel, x, surface, pixels, judges, many, steps, outlines)
         findings[at] = best
         say(f"{best.name}: finest steps, error {best.error:.4f}")
     return Found(best, findings, looks)
+
+
+def refined(
+    vessel: Vessel, x: Float[np.ndarray, " unknowns"], detail: Detail
+) -> tuple[Vessel, Float[np.ndarray, " others"]]:
+    """Returns a vessel with another detail, and the unknowns that give it the same shape.
+
+    Args:
+      vessel: model of a vessel.
+      x: its unknowns.
+      detail: detail of the other; its relief gets no offsets.
+    """
+    other = Vessel(vessel.outer, vessel.interior_at_start, detail)
+    found, old, new = other.start(), vars(vessel.layout), vars(other.layout)
+    for name, place in old.items():
+        if isinstance(place, slice) and name not in ("outer", "relief"):
+            found[new[name]] = x[place]
+    wall = vessel.outer_wall
+    offsets = wall.hats @ x[vessel.layout.outer]
+    found[other.layout.outer] = np.interp(other.outer_wall.knots, wall.at, offsets)
+    return other, found
 
 
 def _close(findings: Sequence[Finding], settings: SearchSettings) -> list[int]:

@@ -102,6 +102,7 @@ class Vessel:
     Attributes:
       interior_at_start: contents at the start.
       layout: places of the unknowns.
+      outer_wall: its outer wall, without offsets.
       size: diameter, world units.
     """
 
@@ -116,11 +117,11 @@ class Vessel:
         self.outer, self.interior_at_start, self.detail = outer, interior, detail
         profile = walls.with_punt(Profile(outer.points, closed=False), interior.punt)
         self.size = _size(outer.points)
-        knots = max(_KNOTS, outer.knots) if detail.ridges else _KNOTS
+        knots = max(_KNOTS, outer.knots) if detail.fine else _KNOTS
         points = detail.outer + (detail.ridges if outer.knots > _KNOTS else 0)
-        self._outer = Wall(profile, points=points, knots=knots)
+        self.outer_wall = Wall(profile, points=points, knots=knots)
         self._looseness = self._find_looseness()
-        raised = math.prod(relief.KNOTS) if detail.relief and outer.relief is not None else 0
+        raised = math.prod(relief.KNOTS) if detail.fine and outer.relief is not None else 0
         self.layout = Layout(interior, knots, _INNER_KNOTS, relief=raised)
         if interior.contents != "none":
             ends = {"base": interior.base, "lid": interior.lid}
@@ -146,7 +147,7 @@ class Vessel:
 
     def _find_looseness(self) -> Float[np.ndarray, " knots"]:
         """Returns factors of the deviations of the outer wall's knots, larger at its two ends."""
-        at_knots = self._outer.directions[np.argmax(self._outer.hats, axis=0), 1]
+        at_knots = self.outer_wall.directions[np.argmax(self.outer_wall.hats, axis=0), 1]
         count = len(at_knots)
         first, last = np.flatnonzero(at_knots > -_LEVELLED), np.flatnonzero(at_knots < _LEVELLED)
         bottom, top = first[0] if len(first) else 0, last[-1] + 1 if len(last) else count
@@ -156,7 +157,7 @@ class Vessel:
     def _limits(self) -> tuple[Limits, Int[np.ndarray, " points"]]:
         """Returns the limits of the inner wall at rest, and the nearest points of the outer one."""
         points, directions = self._inner.points, self._inner.directions
-        end = self._rim[0] if self.interior_at_start.mouth else self._outer.length
+        end = self._rim[0] if self.interior_at_start.mouth else self.outer_wall.length
         dense, outer, _ = self._outer_at_rest(end)
         away, nearest = KDTree(outer).query(points)
         least = np.minimum(_LEAST_SHARE * away, _THINNEST * self.size)
@@ -166,7 +167,9 @@ class Vessel:
         inward = -_INWARDS * np.clip(upright, 2.0 * _THINNEST * self.size, half)
         outward = away - least
         width = _FADE * np.minimum(outward, -inward)
-        rows = np.clip(np.searchsorted(self._outer.at, dense[nearest]), 0, len(self._outer.at) - 1)
+        rows = np.clip(
+            np.searchsorted(self.outer_wall.at, dense[nearest]), 0, len(self.outer_wall.at) - 1
+        )
         empty = np.zeros((len(points), 0))
         return Limits(inward, outward, empty, width), rows
 
@@ -183,7 +186,7 @@ class Vessel:
 
         The inner wall ends just before it leaves the outer one.
         """
-        lengths, points, normals = self._outer_at_rest(self._outer.length)
+        lengths, points, normals = self._outer_at_rest(self.outer_wall.length)
         at = np.linspace(0.0, self._inner.length, 8 * len(self._inner.at))
         inner = self._inner.piece(self._still(self._inner), at, np.zeros((len(at), 0))).points
         nearest = KDTree(points).query(inner)[1]
@@ -196,8 +199,10 @@ class Vessel:
 
     def _outer_at_rest(self, end: float) -> tuple[np.ndarray, Curve, Curve]:
         """Returns lengths along the outer wall up to one, and its points and normals there."""
-        dense = np.linspace(0.0, end, 8 * len(self._outer.at))
-        found = self._outer.piece(self._still(self._outer), dense, np.zeros((len(dense), 0)))
+        dense = np.linspace(0.0, end, 8 * len(self.outer_wall.at))
+        found = self.outer_wall.piece(
+            self._still(self.outer_wall), dense, np.zeros((len(dense), 0))
+        )
         return dense, found.points, found.normals
 
     @staticmethod
@@ -207,7 +212,7 @@ class Vessel:
 
     def _shares(self) -> list[Float[np.ndarray, " points"]]:
         """Returns where points are: shares of the outer wall, of the liquid's and of the air's."""
-        interior, outer = self.interior_at_start, self._outer
+        interior, outer = self.interior_at_start, self.outer_wall
         end = self._rim[0] if interior.mouth else outer.length
         found = [walls.shares(outer.at, 0.0, end, len(outer.at))]
         if interior.contents == "none":
@@ -264,7 +269,7 @@ class Vessel:
             glass=numbers["glass"],
             liquid=numbers["liquid"],
             tint=colour(layout.tint, np.exp, rest.tint),
-            absorption=colour(layout.absorption, _not_negative, rest.absorption),
+            absorption=colour(layout.absorption, lambda x: np.maximum(x, 0.0), rest.absorption),
             glass_tint=colour(layout.glass_tint, np.exp, rest.glass_tint),
         )
 
@@ -334,9 +339,9 @@ class Vessel:
         """Returns the closed profiles of the parts."""
         interior, layout = self.interior_at_start, self.layout
         by = np.eye(len(x))[:, 4 : 4 + layout.profile]
-        outer = self._outer.curve(x[layout.outer], by[layout.outer])
+        outer = self.outer_wall.curve(x[layout.outer], by[layout.outer])
         still = np.zeros(layout.profile)
-        whole = walls.between(self._outer, outer, self._plan[0], (0.0, still), (None, still))
+        whole = walls.between(self.outer_wall, outer, self._plan[0], (0.0, still), (None, still))
         if interior.contents == "none":
             return [walls.joined([whole])]
         inner = self._inner_wall(x, by)
@@ -359,7 +364,7 @@ class Vessel:
     ) -> Moved:
         """Returns the inner wall, which the outer one limits."""
         rest, rows = self._rest
-        hats, where = self._outer.hats[rows], self.layout.outer
+        hats, where = self.outer_wall.hats[rows], self.layout.outer
         limits = rest._replace(outward=rest.outward + hats @ x[where], by_outward=hats @ by[where])
         return self._inner.curve(x[self.layout.inner], by[self.layout.inner], limits)
 
@@ -398,7 +403,7 @@ class Vessel:
     ) -> list[Stretch]:
         """Returns the glass of an open vessel: outside up to the rim, and inside down again."""
         ends = [(end, still) for end in self._rim]
-        outside = walls.between(self._outer, outer, self._plan[0], (0.0, still), ends[0])
+        outside = walls.between(self.outer_wall, outer, self._plan[0], (0.0, still), ends[0])
         down = walls.between(self._inner, inner, self._plan[2], bottom, ends[1]).reversed()
         return [outside, walls.bridge(outside, down), down]
 
@@ -484,10 +489,6 @@ def _selected(places: Sequence[slice], each: int, count: int) -> scipy.sparse.cs
         rows = np.eye(count)[at]
         found[each * number : each * number + len(rows)] = rows
     return scipy.sparse.csr_array(found)
-
-
-def _not_negative(values: np.ndarray) -> np.ndarray:
-    return np.maximum(values, 0.0)
 
 
 def _size(points: Curve) -> float:

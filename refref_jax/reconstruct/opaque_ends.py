@@ -93,7 +93,7 @@ def find_opaque_ends(
     if outer.closed:
         return ()
     some = pixels.drawn(np.random.default_rng(seed), _PIXELS)
-    behind = SingleObject(FixedShape(_mesh(outer)), INDEX_OF_AIR, deviation=1.0)
+    behind = SingleObject(FixedShape(outer.mesh()), INDEX_OF_AIR, deviation=1.0)
     traced = gauss_newton.traced_object(behind.pose(behind.start()))
     straight = photometry.encode(photometry.predict(traced, surface, some.rays).linear)
     rows, cells = _places(outer, some.rays)
@@ -115,13 +115,9 @@ def _extent(outer: Revolution) -> tuple[float, float]:
     return float(outer.points[:, 1].min()), float(outer.points[:, 1].max())
 
 
-def _mesh(outer: Revolution) -> Mesh:
-    return mesh_of(outer.pose(outer.start()))
-
-
 def _first_points(outer: Revolution, rays: Rays) -> Float[np.ndarray, "rays 3"]:
     """Returns where rays first meet a surface, in the frame of its axis; NaN where they do not."""
-    distances = np.asarray(find_first_surface(pack_meshes([_mesh(outer)]), rays).distances)
+    distances = np.asarray(find_first_surface(pack_meshes([outer.mesh()]), rays).distances)
     reach = np.where(np.isfinite(distances), distances, np.nan)[:, None]
     points = np.asarray(rays.origins) + reach * np.asarray(rays.directions)
     return (points - outer.axis.point) @ outer.axis.frame

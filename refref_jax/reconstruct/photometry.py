@@ -31,6 +31,7 @@ from refref_jax import numerics
 from refref_jax.compilation import at_once, jit_quickly
 from refref_jax.geometry import bvh_build
 from refref_jax.geometry.bvh import NO_PRIMITIVE
+from refref_jax.geometry.bvh_build import Division
 from refref_jax.geometry.rays import Rays
 from refref_jax.geometry.surfaces import Surfaces
 from refref_jax.optics import light_paths, path_tracing
@@ -108,10 +109,12 @@ class TracedObject(NamedTuple):
     Attributes:
       scene: the scene; its parts are nested dielectrics.
       faces: face of each primitive, counted over all parts.
+      division: division of the faces among the nodes of the tree.
     """
 
     scene: Scene
     faces: Int[np.ndarray, " primitives"]
+    division: Division
 
 
 class Prediction(NamedTuple):
@@ -173,6 +176,8 @@ def assemble(
     normals: Float[np.ndarray, "faces 3 3"],
     parts: Int[np.ndarray, " faces"],
     interfaces: Interfaces,
+    *,
+    like: TracedObject | None = None,
 ) -> TracedObject:
     """Returns a scene of triangles, on the device.
 
@@ -181,8 +186,11 @@ def assemble(
       normals: outward unit shading normals at these corners.
       parts: part of each face.
       interfaces: interfaces of the parts, under the rule `nested`.
+      like: scene of the same faces, elsewhere by little, whose tree is divided alike.
     """
-    bvh, order = bvh_build.build(corners.astype(np.float32))
+    triangles = corners.astype(np.float32)
+    division = bvh_build.divide(triangles) if like is None else like.division
+    bvh, order = bvh_build.build(triangles, division=division)
     order = np.append(order, np.repeat(order[-1:], bvh_build.spare_rows(len(order))))
     packed = Surfaces(
         bvh_build.filled_up(bvh),
@@ -190,7 +198,7 @@ def assemble(
         numerics.host_array(parts[order].astype(np.int32)),
         numerics.host_array(np.zeros((0, 3, 3), np.float32)),
     )
-    return TracedObject(jax.device_put(Scene(packed, interfaces)), order)
+    return TracedObject(jax.device_put(Scene(packed, interfaces)), order, division)
 
 
 def blurred(surface: Backdrop, halvings: int) -> Backdrop:

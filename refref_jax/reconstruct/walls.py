@@ -91,6 +91,7 @@ class Wall:
       length: length of the profile at rest.
       points: these points at rest: radius and height.
       directions: outward unit normals at rest.
+      knots: lengths along the profile at rest of the knots of the offsets.
       hats: offset of each point by that of each knot.
     """
 
@@ -100,7 +101,7 @@ class Wall:
         length = lengths(dense)
         self.length = float(length[-1])
         self.at = places(dense, points)
-        knot = places(dense, knots)
+        self.knots = places(dense, knots)
         self.points = np.stack(
             [
                 CubicSpline(length, dense[:, 0], bc_type="natural")(self.at),
@@ -112,7 +113,7 @@ class Wall:
         one = np.eye(points)
         self._radii = CubicSpline(self.at, one, bc_type="natural")
         self._heights = CubicSpline(self.at, one, bc_type="clamped")
-        self.hats = CubicSpline(knot, np.eye(knots), bc_type="clamped")(self.at)
+        self.hats = CubicSpline(self.knots, np.eye(knots), bc_type="clamped")(self.at)
         self.directions = self.normals(self.points)
 
     def normals(self, points: Curve) -> Curve:
@@ -439,12 +440,12 @@ def without_ridges(profile: Profile, size: float) -> Profile:
     weights = np.ones(len(points))
     for _ in range(_RIDGE_ROUNDS):
         fitted = [
-            matrix @ np.linalg.lstsq(weights[:, None] * matrix, weights * values, rcond=None)[0]
+            matrix @ np.linalg.solve((matrix.T * weights) @ matrix, matrix.T @ (weights * values))
             for matrix, values in zip((radii, heights), points.T, strict=True)
         ]
         found = np.stack(fitted, axis=-1)
         above = np.sum((points - found) * normals, axis=-1) / (_RIDGE * size)
-        weights = 1.0 / np.hypot(1.0, np.maximum(above, 0.0))
+        weights = 1.0 / (1.0 + np.maximum(above, 0.0) ** 2)
     found[[0, -1], 0] = 0.0
     return Profile(found, closed=False)
 

@@ -27,10 +27,17 @@ def _trace(tree, origins, directions, limits, exclude_primitive, *, lockstep=Fal
 
 
 def _closest(
-    triangles, origins, directions, *, limits=None, exclude_primitive=None, lockstep=False
+    triangles,
+    origins,
+    directions,
+    *,
+    limits=None,
+    exclude_primitive=None,
+    lockstep=False,
+    division=None,
 ):
     """Builds a tree and traces rays; returns distances, faces and barycentrics."""
-    tree, slots = bvh_build.build(np.asarray(triangles, np.float32))
+    tree, slots = bvh_build.build(np.asarray(triangles, np.float32), division=division)
     count = len(origins)
     limits = np.full(count, np.inf) if limits is None else limits
     exclude_primitive = (
@@ -59,6 +66,18 @@ def _random_rays(count, seed=1, reach=3.0):
     generator = np.random.default_rng(seed)
     origins = reach * arrays.unit(generator.normal(size=(count, 3)))
     return origins, arrays.unit(generator.uniform(-1, 1, (count, 3)) - origins)
+
+
+@pytest.mark.parametrize("moved", [0.01, 3.0])
+def test_a_tree_divided_like_that_of_other_places_has_the_same_hits(moved):
+    triangles, (origins, directions) = _soup(400), _random_rays(200)
+    shifts = moved * np.random.default_rng(3).normal(size=(400, 1, 3))
+    division = bvh_build.divide(np.float32(triangles + shifts))
+    own = _closest(triangles, origins, directions)
+    found = _closest(triangles, origins, directions, division=division)
+    assert np.any(np.isfinite(own[0]))
+    for each, expected in zip(found, own, strict=True):
+        np.testing.assert_array_equal(each, expected)
 
 
 @pytest.mark.parametrize("faces", [1, 2, 5, 40, 400])

@@ -13,6 +13,7 @@ from refref_jax.geometry.triangle_meshes import (
 from refref_jax.reconstruct import outlines as outlines_module
 from refref_jax.reconstruct.contents import Detail, Interior
 from refref_jax.reconstruct.families import Revolution, fit_revolution
+from refref_jax.reconstruct.interior_search import refined
 from refref_jax.reconstruct.interiors import Vessel
 from refref_jax.reconstruct.masks import Views
 from refref_jax.reconstruct.mesh_distance import signed_distance
@@ -180,7 +181,7 @@ def test_other_unknowns_move_a_vessel_alike_with_and_without_offsets_of_its_reli
     body = vessels.bottle().with_relief(Relief(-1.0, 0.05, relief.factors))
     detail = Detail(outer=48, ridges=0, inner=64, azimuths=48)
     with_offsets, without = (
-        Vessel(body, Interior(wall=0.12, level=-0.2), detail._replace(relief=unknown))
+        Vessel(body, Interior(wall=0.12, level=-0.2), detail._replace(fine=unknown))
         for unknown in (True, False)
     )
     count = without.layout.count
@@ -194,6 +195,22 @@ def test_other_unknowns_move_a_vessel_alike_with_and_without_offsets_of_its_reli
             expected = getattr(other, name)
             found = getattr(one, name).toarray()[:, :count]
             np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("mouth", [False, True])
+def test_a_vessel_with_more_unknowns_has_the_same_shape(relief, mouth):
+    body = vessels.bottle().with_relief(Relief(-1.0, 0.05, relief.factors)).with_knots(80)
+    interior = Interior("liquid and air", mouth=mouth, wall=0.12, level=-0.2, gap=0.05)
+    detail = Detail(outer=48, ridges=100, inner=64, azimuths=48)
+    vessel = Vessel(body, interior, detail._replace(fine=False))
+    x = vessel.start()
+    x[: vessel.layout.profile] += 0.01 * np.random.default_rng(8).normal(size=vessel.layout.profile)
+    other, y = refined(vessel, x, detail)
+    assert len(y) == len(x) + 80 - 36 + np.prod(KNOTS)
+    assert other.interior(y) == vessel.interior(x)
+    moved, still = (vessel.pose(each).parts[0].vertices for each in (x, vessel.start()))
+    found = other.pose(y).parts[0].vertices
+    assert np.abs(found - moved).max() < 0.05 * np.abs(moved - still).max()
 
 
 def test_a_raised_relief_is_that_of_its_offsets(relief):
