@@ -16,7 +16,6 @@ stays as it is.
 """
 
 import functools
-import itertools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -441,7 +440,6 @@ def _search(
         if best.contents == "none" and not best.stained:
             bar.show(100, "solid glass")
             return []
-        count = itertools.count(10, 8)
         found = interior_search.search(
             outer,
             surface,
@@ -450,7 +448,7 @@ def _search(
             settings=settings,
             outlines=outlines,
             looks=looks,
-            progress=lambda line: bar.show(min(next(count), 99), line),
+            progress=lambda share, text: bar.show(round(100 * share), text),
         )
         bar.show(100, f"vessel: {found.best.name}")
     return [found.best, *(each for each in found.findings if each.name != found.best.name)]

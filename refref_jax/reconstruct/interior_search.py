@@ -13,6 +13,8 @@ Source: ours.
 """
 
 import dataclasses
+import functools
+import itertools
 import math
 import operator
 from collections.abc import Callable, Sequence
@@ -49,6 +51,10 @@ _BASES = (0.03, 0.05, 0.07, 0.1, 0.14, 0.2, 0.28, 0.36, 0.45, 0.55, 0.7, 0.85)
 _LIDS = (0.03, 0.05, 0.08, 0.12, 0.17, 0.24, 0.33, 0.45)
 _PUNTS = (0.006, 0.012, 0.02, 0.03, 0.045)
 _BLUR = 2
+
+# Shares of the work that are done after looks, rough fits, more looks, fits of all unknowns, and
+# further steps.
+_LOOKED, _ROUGH, _AGAIN, _ALL, _LAST = 0.1, 0.4, 0.6, 0.75, 0.85
 
 
 class Finding(NamedTuple):
@@ -158,7 +164,7 @@ def search(
     detail: Detail = FINE,
     outlines: Callable[[Candidate], Rows] | None = None,
     looks: list[Look] | None = None,
-    progress: Callable[[str], None] | None = None,
+    progress: Callable[[float, str], None] | None = None,
 ) -> Found:
     """Finds what is inside a vessel.
 
@@ -171,43 +177,53 @@ def search(
       detail: resolution of the meshes of the last fit.
       outlines: equations of the masks' outlines, for that fit.
       looks: looks at all hypotheses, if there are any yet (`looks_at_all`).
-      progress: function called with a line about each fit.
+      progress: function called with the share of the work that is done, and a line of text.
 
     Raises:
       ReconstructionError: if there are no pixels, the object is a ring, or no wall fits into it.
     """
-    settings, say = settings or SearchSettings(), progress or (lambda line: None)
+    settings, say = settings or SearchSettings(), progress or (lambda share, text: None)
     looks = looks or looks_at_all(outer, surface, pixels, settings)
-    say(f"{len(looks)} looks; best: {looks[0].interior.name}, error {looks[0].error:.4f}")
-    rough, findings = [], []
-    for found in finalists(looks, settings):
+    say(_LOOKED, f"{len(looks)} looks; best: {looks[0].interior.name}, error {looks[0].error:.4f}")
+    rough, findings, few = [], [], finalists(looks, settings)
+    report = _reporter(say, _LOOKED, _ROUGH, len(few))
+    for found in few:
         rough.append(_few_fitted(outer, found.interior, surface, pixels, judges, settings))
-        say(f"{rough[-1].name}: looked {found.error:.4f}, error {rough[-1].error:.4f}")
+        report(f"{rough[-1].name}: looked {found.error:.4f}, error {rough[-1].error:.4f}")
     rivals = _best_of_kinds(rough, settings)
-    again = _looked_again(outer, rivals, surface, pixels, settings)
-    for interior in again or [each.vessel.interior_at_start for each in rivals]:
+    report = _reporter(say, _ROUGH, _AGAIN, len(settings.mouths) * len(rivals))
+    again = _looked_again(outer, rivals, surface, pixels, settings, report=report)
+    again = again or [each.vessel.interior_at_start for each in rivals]
+    report = _reporter(say, _AGAIN, _ALL, len(again))
+    fitted = functools.partial(_fitted, surface, pixels, judges, outlines)
+    for interior in again:
         vessel = Vessel(outer, interior, detail._replace(fine=False))
-        start, steps = vessel.start(), settings.all
-        fitted = _fitted(vessel, start, surface, pixels, judges, settings, steps, outlines)
-        findings.append(fitted)
-        say(f"{interior.name}: all unknowns, error {findings[-1].error:.4f}")
-    steps = settings.last
-    for number in _close(findings, settings) if steps else []:
-        vessel, x = findings[number].vessel, findings[number].x
-        last = _fitted(vessel, x, surface, pixels, judges, settings, steps, outlines)
-        say(f"{last.name}: further steps, error {last.error:.4f}")
+        findings.append(fitted(settings, vessel, vessel.start(), settings.all))
+        report(f"{interior.name}: all unknowns, error {findings[-1].error:.4f}")
+    close = _close(findings, settings) if settings.last else []
+    report = _reporter(say, _ALL, _LAST, len(close))
+    for number in close:
+        last = fitted(settings, findings[number].vessel, findings[number].x, settings.last)
+        report(f"{last.name}: further steps, error {last.error:.4f}")
         findings[number] = last
     best = _simplest(findings)
     if settings.finest and outer.is_fine:
-        at = next(number for number, each in enumerate(findings) if each is best)
         many = dataclasses.replace(
             settings, rays=2 * settings.rays, last_rays=2 * settings.last_rays
         )
-        (vessel, x), steps = refined(best.vessel, best.x, detail), settings.finest
-        best = _fitted(vessel, x, surface, pixels, judges, many, steps, outlines)
-        findings[at] = best
-        say(f"{best.name}: finest steps, error {best.error:.4f}")
+        report = _reporter(say, _LAST, 1.0, len(settings.finest))
+        finest = fitted(many, *refined(best.vessel, best.x, detail), settings.finest, report=report)
+        findings = [finest if each is best else each for each in findings]
+        best = finest
     return Found(best, findings, looks)
+
+
+def _reporter(
+    say: Callable[[float, str], None], begin: float, end: float, count: int
+) -> Callable[[str], None]:
+    """Returns a function that reports one more of some pieces of work between two shares."""
+    done = itertools.count(1)
+    return lambda text: say(begin + (end - begin) * min(next(done) / max(count, 1), 1.0), text)
 
 
 def refined(
@@ -262,19 +278,35 @@ def _few_fitted(
 
 
 def _fitted(
-    vessel: Vessel,
-    x: Float[np.ndarray, " unknowns"],
     surface: Backdrop,
     pixels: Photographs,
     judges: Photographs,
-    settings: SearchSettings,
-    blurs: tuple[int, ...],
     outlines: Callable[[Candidate], Rows] | None,
+    settings: SearchSettings,
+    vessel: Vessel,
+    x: Float[np.ndarray, " unknowns"],
+    blurs: tuple[int, ...],
+    *,
+    report: Callable[[str], None] = lambda text: None,
 ) -> Finding:
-    """Returns a hypothesis after steps of all unknowns."""
-    seed = settings.seed + len(blurs)
-    steps = Steps(blurs, settings.last_rays, settings.rays, _OUTLIERS, seed=seed)
-    fit = gauss_newton.fit(vessel, x, surface, pixels, settings=steps, outlines=outlines)
+    """Returns a hypothesis after steps of all unknowns, of which each is reported."""
+    fit = gauss_newton.fit(
+        vessel,
+        x,
+        surface,
+        pixels,
+        settings=Steps(
+            blurs,
+            settings.last_rays,
+            settings.rays,
+            _OUTLIERS,
+            seed=settings.seed + len(blurs),
+        ),
+        outlines=outlines,
+        progress=lambda number, facts: report(
+            f"{vessel.interior_at_start.name}: error {min(facts.before, facts.after):.4f}"
+        ),
+    )
     return _finding(vessel, fit, surface, judges)
 
 
@@ -300,6 +332,8 @@ def _looked_again(
     surface: Backdrop,
     pixels: Photographs,
     settings: SearchSettings,
+    *,
+    report: Callable[[str], None] = lambda text: None,
 ) -> list[Interior]:
     """Returns the interiors of findings, with the level, gap, ends and punt that suit them best.
 
@@ -323,6 +357,7 @@ def _looked_again(
             if best.error < math.inf:  # otherwise there is no mouth at its top
                 name = best.interior.name
                 kept[name] = min(kept.get(name, best), best, key=_error)
+                report(f"{name}: looked again, error {best.error:.4f}")
     least = min((each.error for each in kept.values()), default=math.inf)
     return [each.interior for each in kept.values() if each.error <= settings.rivals * least]
 

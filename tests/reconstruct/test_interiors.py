@@ -16,7 +16,7 @@ from refref_jax.reconstruct import (
 )
 from refref_jax.reconstruct.contents import Detail, Interior
 from refref_jax.reconstruct.families import Revolution
-from refref_jax.reconstruct.interior_looks import SearchSettings, hypotheses, look
+from refref_jax.reconstruct.interior_looks import Look, SearchSettings, hypotheses, look
 from refref_jax.reconstruct.interior_search import Few, _finding, _looked_again, _simplest
 from refref_jax.reconstruct.interiors import Vessel
 from refref_jax.reconstruct.mesh_distance import signed_distance
@@ -379,3 +379,35 @@ def test_looks_tell_coloured_solid_glass_from_a_vessel(body, surface, small_tile
     settings = SearchSettings((0.05,), 1, (0.04,), (1.36,), mouths=(False,), blur=1, pixels=800)
     looks = interior_looks.looks_at_all(body, surface, seen, settings)
     assert looks[0].interior.contents == "none"
+
+
+@pytest.mark.slow
+def test_the_finest_steps_find_a_ridge_and_are_reported(body, surface, small_tiles, monkeypatch):
+    del small_tiles
+    monkeypatch.setattr(interior_search, "_VARIANTS", ())
+    fine, detail = body.with_knots(80), Detail(outer=48, ridges=60, inner=64, azimuths=48)
+    truth = Vessel(fine, _FLASK, detail)
+    raised = truth.start()
+    raised[truth.layout.outer][38:42] += 0.01
+    monkeypatch.setattr(truth, "start", lambda: raised)
+    seen, told = vessels.photographs(truth, surface, reach=1.4), []
+    settings = SearchSettings(
+        few=(1,), all=(0,), last=(), finest=(0, 0, 0), rays=2000, last_rays=2000, mouths=(False,)
+    )
+    options = {"detail": detail, "looks": [Look(_FLASK, 0.1)]}
+    found = interior_search.search(
+        fine,
+        surface,
+        seen,
+        seen,
+        settings=settings,
+        progress=lambda share, text: told.append(share),
+        **options,
+    )
+    settings = dataclasses.replace(settings, finest=())
+    plain = interior_search.search(fine, surface, seen, seen, settings=settings, **options)
+    assert len(found.best.x) == len(plain.best.x) + 80 - 36
+    assert found.best.error < 0.7 * plain.best.error
+    assert found.findings == [found.best]
+    assert told == sorted(told)
+    assert told[-1] == 1.0
