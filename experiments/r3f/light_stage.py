@@ -332,7 +332,8 @@ def fit(
     if _may_be_vessel(outer, trials):
         trials = (*trials, *_vessels(outer, known, surface, seen, outlines, seed=seed))
     if _is_unexplained(trials) and not revolved.ends:
-        trials = (*trials, *_free_vessels(mesh, known, surface, seen, outlines, seed=seed))
+        rival = min(trial.error for trial in trials)
+        trials = (*trials, *_free_vessels(mesh, known, surface, seen, outlines, rival, seed=seed))
     masks, chosen, _ = choose(scene, mesh, trials)
     if chosen is masks or isinstance(chosen.model, Vessel):
         return trials
@@ -390,10 +391,17 @@ def _is_unexplained(trials: Sequence[Trial]) -> bool:
 
 
 def _free_vessels(
-    mesh: Mesh, known: IndexFacts, surface: Backdrop, seen: Seen, outlines: Outlines, *, seed: int
+    mesh: Mesh,
+    known: IndexFacts,
+    surface: Backdrop,
+    seen: Seen,
+    outlines: Outlines,
+    rival: float,
+    *,
+    seed: int,
 ) -> list[Trial]:
     """Returns a vessel that is no body of revolution; none if no wall fits into the object."""
-    find = functools.partial(free_vessels.fit_free_vessel, mesh, **_glass(known))
+    find = functools.partial(free_vessels.fit_free_vessel, mesh, rival=rival, **_glass(known))
     found = _with_bar("free vessel", find, surface, seen, outlines=outlines, seed=seed)
     return [] if found is None else [found]
 

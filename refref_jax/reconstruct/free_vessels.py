@@ -11,6 +11,7 @@ Source: ours.
 
 import contextlib
 import dataclasses
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -48,6 +49,10 @@ _FIRST_RAYS, _RAYS, _JUDGES = 12_000, 24_000, 8192
 # Share of the pixels of largest derivatives that a step leaves out, least scale of the robust
 # weights in the first step, sRGB, and least gain of a step.
 _OUTLIERS, _WIDEST, _GAIN = 0.02, 0.3, 0.002
+
+# Ratio of its error after the first steps to that of the best other shape beyond which a vessel is
+# given up.
+_HOPELESS = 1.25
 
 # Depth inside which distances are exact, in coarse cells of the grid.
 _DEEP = 4.0
@@ -150,6 +155,7 @@ def fit_free_vessel(
     glass: float = 1.5,
     glass_deviation: float = GLASS_DEVIATION,
     outlines: Callable[[Candidate], Rows] | None = None,
+    rival: float = math.inf,
     seed: int = 0,
     progress: Callable[[float, str], None] = lambda share, text: None,
 ) -> Trial | None:
@@ -163,6 +169,7 @@ def fit_free_vessel(
       glass: index of refraction of the glass to begin with.
       glass_deviation: standard deviation of its prior; 0 keeps it.
       outlines: equations of the masks' outlines.
+      rival: error of the best shape so far; a vessel that is far worse gets no further steps.
       seed: seed of the draws.
       progress: function called with the share of the work that is done, and a line of text.
 
@@ -202,9 +209,11 @@ def fit_free_vessel(
     if best is None:
         return None
     trial, vessel = best
-    fit = fitted(vessel, trial.fit.x, _OTHERS, _RAYS)
-    last = judged(trial.name, vessel, fit, surface, judges)
-    return next((each for each in (last, trial) if not vessel.surfaces_cross(each.fit.x)), None)
+    trials = [trial]
+    if trial.error < _HOPELESS * rival:
+        fit = fitted(vessel, trial.fit.x, _OTHERS, _RAYS)
+        trials.insert(0, judged(trial.name, vessel, fit, surface, judges))
+    return next((each for each in trials if not vessel.surfaces_cross(each.fit.x)), None)
 
 
 def _best_wall(

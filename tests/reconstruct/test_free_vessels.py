@@ -1,5 +1,7 @@
 """Vessels of any shape: their two surfaces, and what light tells of the wall."""
 
+import functools
+
 import numpy as np
 import pytest
 
@@ -105,3 +107,26 @@ def test_light_finds_thickness_and_tint(mesh, inside, monkeypatch):
     # Thin walls shift light by thickness times (index - 1), nearly; 0.08 at the start.
     assert np.median(depth) * (found.glass - 1.0) == pytest.approx(0.06, rel=0.06)
     assert fit.steps[-1].after < 0.2 * fit.steps[0].before
+
+
+@pytest.mark.slow
+def test_a_vessel_that_is_far_worse_than_another_shape_gets_no_further_steps(
+    mesh, inside, monkeypatch
+):
+    monkeypatch.setattr(photometry, "_TILE", 1024)
+    small = {"_WALLS": (0.05,), "_BASES": (0.0,), "_FIRST": (1,), "_OTHERS": (0,)}
+    small |= {"_FIRST_RAYS": 2000, "_RAYS": 2000, "_JUDGES": 2000}
+    for name, value in small.items():
+        monkeypatch.setattr(free_vessels, name, value)
+    monkeypatch.setattr(free_vessels, "distances_inside", lambda mesh: inside)
+    surface = vessels.smooth_backdrop()
+    truth = FreeVessel(mesh, Interior("air", wall=0.12, stained=True), inside)
+    seen = vessels.photographs(truth, surface, reach=0.7)
+    told = []
+    fit = functools.partial(
+        free_vessels.fit_free_vessel, mesh, surface, seen, seen, progress=lambda *x: told.append(x)
+    )
+    given_up, steps = fit(rival=1e-6), len(told)
+    followed = fit()
+    assert len(told) - steps == steps + 1
+    assert followed.error < given_up.error
