@@ -12,6 +12,7 @@ The outer surface must come from masks: fitting it to light first would dent it.
 Source: ours.
 """
 
+import contextlib
 import dataclasses
 import functools
 import itertools
@@ -24,7 +25,7 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Float
 
-from refref_jax.reconstruct import gauss_newton, photometry
+from refref_jax.reconstruct import ReconstructionError, gauss_newton, photometry
 from refref_jax.reconstruct.contents import COARSE, FINE, Detail, Interior
 from refref_jax.reconstruct.families import Revolution
 from refref_jax.reconstruct.gauss_newton import Candidate, Fit, Matrix, Model, Rows, Steps
@@ -194,12 +195,16 @@ def search(
     report = _reporter(say, _ROUGH, _AGAIN, len(settings.mouths) * len(rivals))
     again = _looked_again(outer, rivals, surface, pixels, settings, report=report)
     again = again or [each.vessel.interior_at_start for each in rivals]
-    report = _reporter(say, _AGAIN, _ALL, len(again))
+    report = _reporter(say, _AGAIN, _ALL, len(again) + len(settings.shifts))
     fitted = functools.partial(_fitted, surface, pixels, judges, outlines)
     for interior in again:
         vessel = Vessel(outer, interior, detail._replace(fine=False))
         findings.append(fitted(settings, vessel, vessel.start(), settings.all))
         report(f"{interior.name}: all unknowns, error {findings[-1].error:.4f}")
+    for other in _with_other_levels(min(findings, key=_error), settings):
+        moved = fitted(settings, other, other.start(), settings.all)
+        findings = [_better(moved, each) for each in findings]
+        report(f"{moved.name}: another level, error {moved.error:.4f}")
     close = _close(findings, settings) if settings.last else []
     report = _reporter(say, _ALL, _LAST, len(close))
     for number in close:
@@ -216,6 +221,22 @@ def search(
         findings = [finest if each is best else each for each in findings]
         best = finest
     return Found(best, findings, looks)
+
+
+def _with_other_levels(finding: Finding, settings: SearchSettings) -> list[Vessel]:
+    """Returns the vessel of a finding with other levels: its walls may have hidden a wrong one."""
+    at, vessel, found = _with_wall(finding), finding.vessel, []
+    for shift in settings.shifts if at.level_unknown else ():
+        level = at.level + shift * extent(vessel.outer)[0]
+        with contextlib.suppress(ReconstructionError):  # of a wall that leaves no space
+            moved = dataclasses.replace(at, level=level)
+            found.append(Vessel(vessel.outer, moved, vessel.detail))
+    return found
+
+
+def _better(finding: Finding, other: Finding) -> Finding:
+    """Returns a finding if it has the kind of another one and a smaller error; else the other."""
+    return finding if finding.name == other.name and finding.error < other.error else other
 
 
 def _reporter(

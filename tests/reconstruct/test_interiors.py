@@ -1,6 +1,7 @@
 """Vessels with liquid and air inside: their unknowns, and what light tells of them."""
 
 import dataclasses
+import types
 
 import numpy as np
 import pytest
@@ -17,7 +18,15 @@ from refref_jax.reconstruct import (
 from refref_jax.reconstruct.contents import Detail, Interior
 from refref_jax.reconstruct.families import Revolution
 from refref_jax.reconstruct.interior_looks import Look, SearchSettings, hypotheses, look
-from refref_jax.reconstruct.interior_search import Few, _finding, _looked_again, _simplest
+from refref_jax.reconstruct.interior_search import (
+    Few,
+    Finding,
+    _better,
+    _finding,
+    _looked_again,
+    _simplest,
+    _with_other_levels,
+)
 from refref_jax.reconstruct.interiors import Vessel
 from refref_jax.reconstruct.mesh_distance import signed_distance
 from refref_jax.reconstruct.revolution import Axis, Profile
@@ -310,6 +319,28 @@ def test_the_simplest_of_equally_good_findings_is_kept(body, surface, photograph
     simple, stained = finding(_FLASK), finding(dataclasses.replace(_FLASK, stained=True))
     wrong = finding(Interior("liquid", wall=0.12))
     assert _simplest([wrong, simple, stained]) is simple
+
+
+def test_the_best_finding_is_fitted_once_more_from_other_levels(body):
+    vessel = Vessel(body, dataclasses.replace(_FLASK, wall=0.1), _TINY)
+    x = vessel.start()
+    x[vessel.layout.level] += 0.03
+    x[vessel.layout.inner] -= 0.02
+    trial = types.SimpleNamespace(fit=gauss_newton.Fit(x, np.eye(len(x)), ()), error=0.1)
+    finding = Finding(vessel, trial)
+    found = _with_other_levels(finding, SearchSettings(shifts=(0.04, -0.04, 0.0)))
+    levels = [each.interior_at_start.level - _FLASK.level for each in found]
+    np.testing.assert_allclose(levels, 0.03 + 2.6 * np.array([0.04, -0.04, 0.0]), atol=0.01)
+    walls = [each.interior_at_start.wall for each in found]
+    np.testing.assert_allclose(walls, 0.12)
+    assert {each.detail for each in found} == {_TINY}
+    solid = Vessel(body, Interior("liquid", wall=0.1), _TINY)
+    fit = gauss_newton.Fit(solid.start(), np.eye(solid.layout.count), ())
+    other = Finding(solid, types.SimpleNamespace(fit=fit, error=0.05))
+    assert _with_other_levels(other, SearchSettings()) == []
+    assert _better(finding, other) is other  # of another kind
+    worse = Finding(vessel, types.SimpleNamespace(fit=finding.trial.fit, error=0.2))
+    assert _better(worse, finding) is _better(finding, worse) is finding
 
 
 @pytest.mark.slow
