@@ -332,7 +332,7 @@ def build(
       the last face, and is never hit).
 
     Raises:
-      ValueError: if a coordinate is not finite.
+      ValueError: if a coordinate is not finite, or the division is one of more or fewer faces.
     """
     if not np.all(np.isfinite(triangles)):
         raise ValueError(
@@ -343,6 +343,11 @@ def build(
         return _empty(triangles.dtype), np.zeros(LEAF_SIZE, np.int32)
     lower, upper = triangles.min(axis=1), triangles.max(axis=1)
     levels, order = division or divide(triangles)
+    if len(order) != len(triangles):
+        raise ValueError(
+            f"The division has {len(order)} faces, the mesh {len(triangles)}. Pass the division of "
+            "the same faces, or none."
+        )
     primitive_ids = np.concatenate([order, np.repeat(order[-1], LEAF_SIZE)])
     nodes = pack_nodes(levels, lower[order], upper[order])
     facets = prepare_facets(triangles[primitive_ids])

@@ -25,6 +25,7 @@ from refref_jax.reconstruct.revolution import (
     Axis,
     Curve,
     Fit,
+    Lathe,
     Profile,
     even_profile,
     find_axis,
@@ -255,15 +256,16 @@ class Revolution:
 
     def mesh(self) -> Mesh:
         """Returns the body at rest."""
-        turned, pose = without_unknowns(self.profile(self.start())), np.zeros(5)
-        at = (turned, self._lathe, _AROUND_AXIS, self.axis, pose)
-        return mesh_of(place(*at, relief=self.relief))
+        return mesh_of(place(*self._at_rest(), relief=self.relief))
 
     def raised(self, relief: Relief, offsets: Offsets) -> Posed:
         """Returns the body with a relief and offsets of it, which are its last unknowns."""
-        turned, pose = without_unknowns(self.profile(self.start())), np.zeros(5)
-        at = (turned, self._lathe, _AROUND_AXIS, self.axis, pose)
-        return place_raised(*at, relief, offsets)
+        return place_raised(*self._at_rest(), relief, offsets)
+
+    def _at_rest(self) -> tuple[Turned, Lathe, int, Axis, Unknowns]:
+        """Returns the arguments that place the body at rest, without unknowns of its own."""
+        turned = without_unknowns(self.profile(self.start()))
+        return turned, self._lathe, _AROUND_AXIS, self.axis, np.zeros(5)
 
     def moved(self, unknowns: Unknowns) -> "Revolution":
         """Returns the body at given unknowns, at rest."""

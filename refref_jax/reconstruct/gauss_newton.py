@@ -194,7 +194,7 @@ class Equations(NamedTuple):
 
 
 def traced_object(candidate: Candidate, *, like: TracedObject | None = None) -> TracedObject:
-    """Returns the scene of a candidate, on the device, faster with one of the same faces."""
+    """Returns the scene of a candidate on the device, its tree divided like that of another."""
     parts = candidate.parts
     return photometry.assemble(
         np.concatenate([part.vertices[part.faces] for part in parts]),

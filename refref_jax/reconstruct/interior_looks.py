@@ -58,8 +58,8 @@ class SearchSettings:
       finalists: number of hypotheses of each kind that are improved.
       few: blurs of the steps of the few numbers of a hypothesis.
       all: blurs of the steps of all unknowns, of each kind.
-      shifts: shifts of the level, as shares of the height, with which the best finding is fitted
-        once more; walls hide a wrong level.
+      level_shifts: shifts of the level, as shares of the height, with which the best finding is
+        fitted once more; walls can hide a wrong level.
       last: blurs of the further steps of the best findings.
       finest: blurs of the final steps of the best finding, if its outside has ridges or a relief.
       rays: number of pixels of a step of the few numbers.
@@ -83,7 +83,7 @@ class SearchSettings:
     finalists: int = 2
     few: tuple[int, ...] = (3, 3, 3, 2, 2, 2, 1, 1, 1)
     all: tuple[int, ...] = (2, 2, 1, 1, 0, 0, 0)
-    shifts: tuple[float, ...] = (0.04, -0.04)
+    level_shifts: tuple[float, ...] = (0.04, -0.04)
     last: tuple[int, ...] = (1, 0, 0, 0, 0, 0, 0, 0, 0, 0)
     finest: tuple[int, ...] = (1, *((0,) * 15))
     rays: int = 8192

@@ -195,7 +195,7 @@ def search(
     report = _reporter(say, _ROUGH, _AGAIN, len(settings.mouths) * len(rivals))
     again = _looked_again(outer, rivals, surface, pixels, settings, report=report)
     again = again or [each.vessel.interior_at_start for each in rivals]
-    report = _reporter(say, _AGAIN, _ALL, len(again) + len(settings.shifts))
+    report = _reporter(say, _AGAIN, _ALL, len(again) + len(settings.level_shifts))
     fitted = functools.partial(_fitted, surface, pixels, judges, outlines)
     for interior in again:
         vessel = Vessel(outer, interior, detail._replace(fine=False))
@@ -226,7 +226,7 @@ def search(
 def _with_other_levels(finding: Finding, settings: SearchSettings) -> list[Vessel]:
     """Returns the vessel of a finding with other levels: its walls may have hidden a wrong one."""
     at, vessel, found = _with_wall(finding), finding.vessel, []
-    for shift in settings.shifts if at.level_unknown else ():
+    for shift in settings.level_shifts if at.level_unknown else ():
         level = at.level + shift * extent(vessel.outer)[0]
         with contextlib.suppress(ReconstructionError):  # of a wall that leaves no space
             moved = dataclasses.replace(at, level=level)

@@ -102,7 +102,7 @@ class Vessel:
     Attributes:
       interior_at_start: contents at the start.
       layout: places of the unknowns.
-      outer_wall: its outer wall, without offsets.
+      outer_wall: outer wall, without offsets.
       size: diameter, world units.
     """
 

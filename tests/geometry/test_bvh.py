@@ -80,6 +80,11 @@ def test_a_tree_divided_like_that_of_other_places_has_the_same_hits(moved):
         np.testing.assert_array_equal(each, expected)
 
 
+def test_the_division_of_another_number_of_faces_is_refused():
+    with pytest.raises(ValueError, match="division has 39 faces, the mesh 40"):
+        bvh_build.build(np.float32(_soup(40)), division=bvh_build.divide(np.float32(_soup(39))))
+
+
 @pytest.mark.parametrize("faces", [1, 2, 5, 40, 400])
 def test_hits_of_random_rays_equal_brute_force(faces):
     triangles = _soup(faces)

@@ -328,7 +328,7 @@ def test_the_best_finding_is_fitted_once_more_from_other_levels(body):
     x[vessel.layout.inner] -= 0.02
     trial = types.SimpleNamespace(fit=gauss_newton.Fit(x, np.eye(len(x)), ()), error=0.1)
     finding = Finding(vessel, trial)
-    found = _with_other_levels(finding, SearchSettings(shifts=(0.04, -0.04, 0.0)))
+    found = _with_other_levels(finding, SearchSettings(level_shifts=(0.04, -0.04, 0.0)))
     levels = [each.interior_at_start.level - _FLASK.level for each in found]
     np.testing.assert_allclose(levels, 0.03 + 2.6 * np.array([0.04, -0.04, 0.0]), atol=0.01)
     walls = [each.interior_at_start.wall for each in found]

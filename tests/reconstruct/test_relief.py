@@ -213,6 +213,13 @@ def test_a_vessel_with_more_unknowns_has_the_same_shape(relief, mouth):
     assert np.abs(found - moved).max() < 0.05 * np.abs(moved - still).max()
 
 
+def test_the_mesh_of_a_body_is_that_of_its_pose(relief):
+    for body in (vessels.bottle(), vessels.bottle().with_relief(relief)):
+        found, posed = body.mesh(), body.pose(body.start())
+        np.testing.assert_allclose(found.vertices, posed.vertices, atol=1e-12)
+        np.testing.assert_array_equal(found.faces, posed.faces)
+
+
 def test_a_raised_relief_is_that_of_its_offsets(relief):
     offsets = 0.02 * np.random.default_rng(4).normal(size=KNOTS)
     points = np.random.default_rng(5).uniform(-0.8, 0.8, size=(200, 3))
