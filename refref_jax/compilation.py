@@ -6,7 +6,7 @@ traversal about five times faster. The attribute is internal to XLA: versions th
 ignore it, and only the speed changes.
 
 `chosen_by_platform` makes one function of two, for CPUs and for other devices. `at_once` runs
-programs in several threads of the host.
+programs in several threads of the host, and `traced_once` lets one of them trace each program.
 
 NVIDIA GPUs need flags of XLA with some versions (`NEEDED_FLAGS`): scatter-adds of single floats are
 compiled as loops that compare and swap, hundreds of times slower than an addition in memory, and
@@ -20,8 +20,9 @@ import contextlib
 import functools
 import importlib.metadata
 import os
+import threading
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Literal, NamedTuple, ParamSpec, TypeVar
 
@@ -251,6 +252,33 @@ def at_once(function: Callable[..., _Result], *each: Sequence[Any]) -> list[_Res
 
     with ThreadPoolExecutor(threads()) as workers:
         return list(workers.map(with_settings, *each))
+
+
+def traced_once(program: Callable[..., _Result]) -> Callable[..., _Result]:
+    """Wraps a jitted program so that threads that call it for the first time trace it once.
+
+    JAX would trace and compile it in each of them. Here the others wait, for each kind of
+    arguments.
+
+    Args:
+      program: jitted function; its static arguments can be hashed.
+    """
+    locks: dict[Hashable, threading.RLock] = {}
+    done: set[Hashable] = set()
+
+    @functools.wraps(program)
+    def run(*arguments: Any, **options: Any) -> _Result:
+        leaves, structure = jax.tree.flatten((arguments, options))
+        kinds = tuple((getattr(x, "shape", x), getattr(x, "dtype", None)) for x in leaves)
+        kind = structure, kinds
+        if kind in done:
+            return program(*arguments, **options)
+        with locks.setdefault(kind, threading.RLock()):
+            found = program(*arguments, **options)
+            done.add(kind)
+        return found
+
+    return run
 
 
 def refuse_tracers(tree: Any, *, instead: str) -> None:

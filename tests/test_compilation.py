@@ -35,13 +35,13 @@ def installed(monkeypatch):
 
     monkeypatch.setattr(importlib.metadata, "version", version)
     monkeypatch.setattr(compilation, "has_started", lambda: False)
-    monkeypatch.setenv("XLA_FLAGS", "--xla_dump_to=here")
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=false")
     return versions
 
 
 def test_a_slow_version_with_a_cuda_plugin_gets_the_flag(installed):
     compilation.add_missing_flags()
-    assert os.environ["XLA_FLAGS"] == f"--xla_dump_to=here {_FLAG} {_NO_AUTOTUNER}"
+    assert os.environ["XLA_FLAGS"] == f"--xla_cpu_enable_fast_math=false {_FLAG} {_NO_AUTOTUNER}"
     compilation.add_missing_flags()
     assert os.environ["XLA_FLAGS"].count("nvptx") == os.environ["XLA_FLAGS"].count("tuner") == 1
 
@@ -50,13 +50,13 @@ def test_a_slow_version_with_a_cuda_plugin_gets_the_flag(installed):
 def test_other_versions_which_refuse_the_flag_do_not_get_it(installed, version):
     installed["jaxlib"] = version
     compilation.add_missing_flags()
-    assert os.environ["XLA_FLAGS"] == f"--xla_dump_to=here {_NO_AUTOTUNER}"
+    assert os.environ["XLA_FLAGS"] == f"--xla_cpu_enable_fast_math=false {_NO_AUTOTUNER}"
 
 
 def test_versions_that_are_not_known_get_no_flag(installed):
     installed["jaxlib"] = "0.12.0"
     compilation.add_missing_flags()
-    assert os.environ["XLA_FLAGS"] == "--xla_dump_to=here"
+    assert os.environ["XLA_FLAGS"] == "--xla_cpu_enable_fast_math=false"
 
 
 def test_the_autotuner_stays_as_a_user_has_set_it(installed, monkeypatch):
@@ -69,7 +69,7 @@ def test_the_autotuner_stays_as_a_user_has_set_it(installed, monkeypatch):
 def test_nothing_is_set_without_a_cuda_plugin(installed):
     del installed["jax-cuda13-plugin"]
     compilation.add_missing_flags()
-    assert os.environ["XLA_FLAGS"] == "--xla_dump_to=here"
+    assert os.environ["XLA_FLAGS"] == "--xla_cpu_enable_fast_math=false"
 
 
 @pytest.mark.parametrize(
@@ -92,7 +92,7 @@ def test_a_warning_says_what_to_do_where_it_is_too_late(installed, monkeypatch):
     assert [str(each.message).partition("JAX starts: ")[2] for each in told] == [
         f"{_FLAG} {_NO_AUTOTUNER}"
     ]
-    assert os.environ["XLA_FLAGS"] == "--xla_dump_to=here"
+    assert os.environ["XLA_FLAGS"] == "--xla_cpu_enable_fast_math=false"
 
 
 def test_other_options_of_the_same_flag_are_not_overwritten(installed, monkeypatch):
@@ -248,6 +248,46 @@ def test_the_first_error_ends_what_is_computed_at_once():
     with pytest.raises(KeyError, match="0"):
         compilation.at_once(fail, range(100))
     assert len(begun) < 100
+
+
+def test_threads_wait_for_one_that_traces_a_program(monkeypatch):
+    monkeypatch.setattr(compilation, "runs_on_cpu", lambda: True)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 1}, raising=False)
+    traced = []
+
+    @compilation.traced_once
+    @functools.partial(jax.jit, static_argnames="power")
+    def raised(x, *, power):
+        traced.append(x.shape)
+        time.sleep(0.2)  # long enough for another thread to begin
+        return x**power
+
+    both = threading.Barrier(2, timeout=60.0)
+
+    def together(x):
+        both.wait()
+        return raised(x, power=2)
+
+    squares = compilation.at_once(together, [jnp.full(3, 2.0), jnp.full(3, 3.0)])
+    np.testing.assert_array_equal(squares, [[4.0] * 3, [9.0] * 3])
+    assert traced == [(3,)]
+    assert raised(jnp.full(3, 2.0), power=3).tolist() == [8.0] * 3
+    assert raised(jnp.full(4, 2.0), power=2).tolist() == [4.0] * 4
+    assert traced == [(3,), (3,), (4,)]
+
+
+def test_a_program_that_fails_while_it_is_traced_lets_others_try():
+    begun = []
+
+    @compilation.traced_once
+    def fail(x):
+        begun.append(x)
+        raise KeyError(x)
+
+    for _ in range(2):
+        with pytest.raises(KeyError):
+            fail(1.0)
+    assert begun == [1.0, 1.0]
 
 
 def test_programs_that_compile_quickly_compute_the_same():

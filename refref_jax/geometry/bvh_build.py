@@ -25,6 +25,9 @@ _BACKWARDS = ((np.arange(OCTANTS)[:, None] >> np.arange(3)) & 1).astype(bool)
 # Relative difference of costs that count as equal: rounding must not choose between them.
 _TIE = 1e-9
 
+# Fewest rows of tables that are filled up.
+_FEWEST_ROWS = 4096
+
 
 class _Grid(NamedTuple):
     """Places of a level's faces, in columns of equal length; a node fills as many as it needs.
@@ -357,10 +360,10 @@ def build(
 
 
 def filled_up(bvh: BVH) -> BVH:
-    """Returns the same tree with rows that are never read, up to round numbers.
+    """Returns the same tree with rows that are never read, up to powers of two.
 
-    The trees of a mesh that moves differ in size: with round numbers, programs that were compiled
-    for one of them serve all.
+    Trees of similar meshes differ in size: programs that were compiled for one of them, which takes
+    longer than a step of a fit, then serve all.
     """
     tables, rows = _filled(np.asarray(bvh.nodes), axis=1), bvh.nodes.shape[1]
     octants = np.arange(OCTANTS, dtype=np.int32)[:, None]
@@ -380,8 +383,8 @@ def _filled(rows: np.ndarray, axis: int = 0) -> np.ndarray:
 
 
 def spare_rows(count: int) -> int:
-    """Returns how many rows `filled_up` adds to some."""
-    return -count % max(256, 1 << max(count.bit_length() - 3, 0))
+    """Returns how many rows `filled_up` adds to a table of some, up to a power of two."""
+    return max(_FEWEST_ROWS, 1 << (count - 1).bit_length()) - count
 
 
 def _empty(dtype: np.dtype) -> BVH:

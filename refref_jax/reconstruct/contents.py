@@ -4,11 +4,13 @@ Source: ours.
 """
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 from refref_jax.choices import CLEAR, NO_ABSORPTION, Colour
 from refref_jax.geometry.triangle_meshes import Mesh
-from refref_jax.optics.media import INDEX_OF_AIR
+from refref_jax.optics.interface_rules import NO_PARENT, nested
+from refref_jax.optics.media import INDEX_OF_AIR, Interfaces
 
 GLASS_DEVIATION = 0.03
 """Standard deviation of the index of glass, which is nearly known."""
@@ -182,3 +184,13 @@ def media_of(now: Interior, at: Layout) -> dict[str, Medium]:
         "liquid": Medium(now.liquid, now.tint, now.absorption, at.liquid, at.tint, at.absorption),
         "air": Medium(INDEX_OF_AIR, CLEAR, clear, fixed, fixed, fixed),
     }
+
+
+def interfaces_of(media: Sequence[Medium]) -> Interfaces:
+    """Returns the interfaces of parts of these media, all of which are in the first one."""
+    return nested(
+        [medium.index for medium in media],
+        [NO_PARENT] + [0] * (len(media) - 1),
+        tints=[medium.tint for medium in media],
+        absorptions=[medium.absorption for medium in media],
+    )

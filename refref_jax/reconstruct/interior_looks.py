@@ -17,6 +17,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from refref_jax.compilation import at_once
 from refref_jax.reconstruct import ReconstructionError, gauss_newton, photometry
 from refref_jax.reconstruct.contents import (
     COARSE,
@@ -62,7 +63,7 @@ class SearchSettings:
         fitted once more; walls can hide a wrong level.
       last: blurs of the further steps of the best findings.
       finest: blurs of the final steps of the best finding, if its outside has ridges or a relief.
-      rays: number of pixels of a step of the few numbers.
+      rays: number of pixels that judge a step; steps of the few numbers take half as many.
       last_rays: number of pixels of a step of all unknowns; twice as many of the finest steps.
       rivals: hypotheses whose error is above that of the best by more than this factor are left
         out before all unknowns are fitted.
@@ -168,7 +169,7 @@ def look(
     if where.stop > where.start:
         darker = x.copy()
         darker[where] += _COUNTING
-        interfaces = jax.device_put(vessel.pose(darker).interfaces)
+        interfaces = jax.device_put(vessel.interfaces(darker))
         scene = scene._replace(scene=scene.scene._replace(interfaces=interfaces))
         dark = photometry.predict(scene, surface, pixels.rays)
         crossings = np.log(np.maximum(dark.linear, 1e-9) / np.maximum(linear, 1e-9)) / _COUNTING
@@ -189,22 +190,22 @@ def _best_tint(
     rgb: Float[np.ndarray, "rays 3"],
 ) -> Float[np.ndarray, "3"]:
     """Returns the logarithm of the tint of least robust error, by channel."""
-    errors = [
-        np.minimum(np.abs(photometry.residuals(linear * np.exp(t * crossings), rgb)), _CAP).mean(0)
-        for t in _LOG_TINTS
-    ]
-    return _LOG_TINTS[np.argmin(np.stack(errors), axis=0)]
+    tinted = linear * np.exp(_LOG_TINTS[:, None, None] * crossings)
+    errors = np.minimum(np.abs(photometry.residuals(tinted, rgb)), _CAP).mean(axis=1)
+    return _LOG_TINTS[np.argmin(errors, axis=0)]
 
 
 def looks_at(
     interiors: Sequence[Interior], outer: Revolution, surface: Backdrop, pixels: Photographs
 ) -> list[Look]:
-    """Returns looks at the hypotheses that fit into an outer surface."""
-    found = []
-    for interior in interiors:
+    """Returns looks at the hypotheses that fit into an outer surface, in order; two at once."""
+
+    def look_at(interior: Interior) -> list[Look]:
         with contextlib.suppress(ReconstructionError):
-            found.append(look(outer, interior, surface, pixels))
-    return found
+            return [look(outer, interior, surface, pixels)]
+        return []
+
+    return [each for found in at_once(look_at, interiors) for each in found]
 
 
 def looks_at_all(

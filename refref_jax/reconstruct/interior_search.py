@@ -18,13 +18,15 @@ import functools
 import itertools
 import math
 import operator
+import threading
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import scipy.sparse
 from jaxtyping import Float
 
+from refref_jax.compilation import at_once
 from refref_jax.reconstruct import ReconstructionError, gauss_newton, photometry
 from refref_jax.reconstruct.contents import COARSE, FINE, Detail, Interior
 from refref_jax.reconstruct.families import Revolution
@@ -56,6 +58,8 @@ _BLUR = 2
 # Shares of the work that are done after looks, rough fits, more looks, fits of all unknowns, and
 # further steps.
 _LOOKED, _ROUGH, _AGAIN, _ALL, _LAST = 0.1, 0.4, 0.6, 0.75, 0.85
+
+_Start = TypeVar("_Start")
 
 
 class Finding(NamedTuple):
@@ -178,7 +182,8 @@ def search(
       detail: resolution of the meshes of the last fit.
       outlines: equations of the masks' outlines, for that fit.
       looks: looks at all hypotheses, if there are any yet (`looks_at_all`).
-      progress: function called with the share of the work that is done, and a line of text.
+      progress: function called with the share of the work that is done, and a line of text; by one
+        thread at a time, which may be another one.
 
     Raises:
       ReconstructionError: if there are no pixels, the object is a ring, or no wall fits into it.
@@ -186,31 +191,25 @@ def search(
     settings, say = settings or SearchSettings(), progress or (lambda share, text: None)
     looks = looks or looks_at_all(outer, surface, pixels, settings)
     say(_LOOKED, f"{len(looks)} looks; best: {looks[0].interior.name}, error {looks[0].error:.4f}")
-    rough, findings, few = [], [], finalists(looks, settings)
+    few = finalists(looks, settings)
     report = _reporter(say, _LOOKED, _ROUGH, len(few))
-    for found in few:
-        rough.append(_few_fitted(outer, found.interior, surface, pixels, judges, settings))
-        report(f"{rough[-1].name}: looked {found.error:.4f}, error {rough[-1].error:.4f}")
-    rivals = _best_of_kinds(rough, settings)
+    first = functools.partial(_few_fitted, outer, surface, pixels, judges, settings)
+    rivals = _best_of_kinds(_fit_each(first, few, "first steps", report), settings)
     report = _reporter(say, _ROUGH, _AGAIN, len(settings.mouths) * len(rivals))
     again = _looked_again(outer, rivals, surface, pixels, settings, report=report)
     again = again or [each.vessel.interior_at_start for each in rivals]
-    report = _reporter(say, _AGAIN, _ALL, len(again) + len(settings.level_shifts))
     fitted = functools.partial(_fitted, surface, pixels, judges, outlines)
-    for interior in again:
-        vessel = Vessel(outer, interior, detail._replace(fine=False))
-        findings.append(fitted(settings, vessel, vessel.start(), settings.all))
-        report(f"{interior.name}: all unknowns, error {findings[-1].error:.4f}")
-    for other in _with_other_levels(min(findings, key=_error), settings):
-        moved = fitted(settings, other, other.start(), settings.all)
+
+    def fit_all(vessel: Vessel) -> Finding:
+        return fitted(settings, vessel, vessel.start(), settings.all)
+
+    report = _reporter(say, _AGAIN, _ALL, len(again) + len(settings.level_shifts))
+    vessels = [Vessel(outer, interior, detail._replace(fine=False)) for interior in again]
+    findings = _fit_each(fit_all, vessels, "all unknowns", report)
+    others = _with_other_levels(min(findings, key=_error), settings)
+    for moved in _fit_each(fit_all, others, "another level", report):
         findings = [_better(moved, each) for each in findings]
-        report(f"{moved.name}: another level, error {moved.error:.4f}")
-    close = _close(findings, settings) if settings.last else []
-    report = _reporter(say, _ALL, _LAST, len(close))
-    for number in close:
-        last = fitted(settings, findings[number].vessel, findings[number].x, settings.last)
-        report(f"{last.name}: further steps, error {last.error:.4f}")
-        findings[number] = last
+    findings = _with_further_steps(findings, fitted, settings, say)
     best = _simplest(findings)
     if settings.finest and outer.is_fine:
         many = dataclasses.replace(
@@ -221,6 +220,22 @@ def search(
         findings = [finest if each is best else each for each in findings]
         best = finest
     return Found(best, findings, looks)
+
+
+def _fit_each(
+    fit: Callable[[_Start], Finding],
+    starts: Sequence[_Start],
+    what: str,
+    report: Callable[[str], None],
+) -> list[Finding]:
+    """Returns the findings of fits, two of which run at once on a CPU; each is reported."""
+
+    def reported(start: _Start) -> Finding:
+        found = fit(start)
+        report(f"{found.name}: {what}, error {found.error:.4f}")
+        return found
+
+    return at_once(reported, starts)
 
 
 def _with_other_levels(finding: Finding, settings: SearchSettings) -> list[Vessel]:
@@ -243,8 +258,13 @@ def _reporter(
     say: Callable[[float, str], None], begin: float, end: float, count: int
 ) -> Callable[[str], None]:
     """Returns a function that reports one more of some pieces of work between two shares."""
-    done = itertools.count(1)
-    return lambda text: say(begin + (end - begin) * min(next(done) / max(count, 1), 1.0), text)
+    done, lock = itertools.count(1), threading.Lock()
+
+    def report(text: str) -> None:
+        with lock:
+            say(begin + (end - begin) * min(next(done) / max(count, 1), 1.0), text)
+
+    return report
 
 
 def refined(
@@ -268,22 +288,35 @@ def refined(
     return other, found
 
 
-def _close(findings: Sequence[Finding], settings: SearchSettings) -> list[int]:
-    """Returns which findings are not clearly worse than the best."""
+def _with_further_steps(
+    findings: Sequence[Finding],
+    fitted: Callable[..., Finding],
+    settings: SearchSettings,
+    say: Callable[[float, str], None],
+) -> list[Finding]:
+    """Returns the findings, with further steps for those not clearly worse than the best."""
     least = min(each.error for each in findings)
-    return [n for n, each in enumerate(findings) if each.error <= settings.close * least]
+    close = [each for each in findings if settings.last and each.error <= settings.close * least]
+    last = _fit_each(
+        lambda each: fitted(settings, each.vessel, each.x, settings.last),
+        close,
+        "further steps",
+        _reporter(say, _ALL, _LAST, len(close)),
+    )
+    better = {id(each): found for each, found in zip(close, last, strict=True)}
+    return [better.get(id(each), each) for each in findings]
 
 
 def _few_fitted(
     outer: Revolution,
-    interior: Interior,
     surface: Backdrop,
     pixels: Photographs,
     judges: Photographs,
     settings: SearchSettings,
+    found: Look,
 ) -> Finding:
     """Returns a hypothesis after steps of its few numbers and of the thickness of its wall."""
-    vessel = Vessel(outer, interior, COARSE)
+    vessel = Vessel(outer, found.interior, COARSE)
     x, layout = vessel.start(), vessel.layout
     one = np.eye(len(x))
     columns = [one[:, layout.outer].sum(axis=1)]
@@ -291,7 +324,7 @@ def _few_fitted(
         columns.append(one[:, layout.inner].sum(axis=1))
     columns += list(one[:, layout.inner.stop :].T)
     few = Few(vessel, x, np.stack(columns, axis=1))
-    steps = Steps(settings.few, settings.rays, settings.rays, _OUTLIERS, seed=settings.seed)
+    steps = Steps(settings.few, settings.rays // 2, settings.rays, _OUTLIERS, seed=settings.seed)
     fit = gauss_newton.fit(few, few.start(), surface, pixels, settings=steps)
     covariance = few.directions @ fit.covariance @ few.directions.T
     whole = Fit(few.whole(fit.x), covariance, fit.steps)
@@ -364,23 +397,36 @@ def _looked_again(
     """
     some = pixels.drawn(np.random.default_rng(settings.seed + 1), settings.pixels)
     blurred, size = photometry.blurred(surface, _BLUR), extent(outer)[0]
+
+    def look_again(at: Interior) -> Look:
+        best = Look(at, math.inf)
+        for variants in _VARIANTS:
+            others = variants(best.interior, size)
+            if others:
+                again = [best.interior, *others]
+                best = min(looks_at(again, outer, blurred, some), key=_error, default=best)
+        if best.error < math.inf:  # otherwise there is no mouth at its top
+            report(f"{best.interior.name}: looked again, error {best.error:.4f}")
+        return best
+
     kept: dict[str, Look] = {}
-    for finding in findings:
-        at = _with_wall(finding)
-        may_be_open = at.contents in ("air", "liquid and air")
-        for mouth in sorted({at.mouth, *settings.mouths}) if may_be_open else [False]:
-            best = Look(dataclasses.replace(at, mouth=mouth), math.inf)
-            for variants in _VARIANTS:
-                others = variants(best.interior, size)
-                if others:
-                    again = [best.interior, *others]
-                    best = min(looks_at(again, outer, blurred, some), key=_error, default=best)
-            if best.error < math.inf:  # otherwise there is no mouth at its top
-                name = best.interior.name
-                kept[name] = min(kept.get(name, best), best, key=_error)
-                report(f"{name}: looked again, error {best.error:.4f}")
+    for at in _with_each_mouth(findings, settings):
+        look = look_again(at)
+        if look.error < math.inf:
+            name = look.interior.name
+            kept[name] = min(kept.get(name, look), look, key=_error)
     least = min((each.error for each in kept.values()), default=math.inf)
     return [each.interior for each in kept.values() if each.error <= settings.rivals * least]
+
+
+def _with_each_mouth(findings: Sequence[Finding], settings: SearchSettings) -> list[Interior]:
+    """Returns the interiors of findings, closed and open if they may be."""
+    found = []
+    for at in map(_with_wall, findings):
+        may_be_open = at.contents in ("air", "liquid and air")
+        mouths = sorted({at.mouth, *settings.mouths}) if may_be_open else [False]
+        found += [dataclasses.replace(at, mouth=mouth) for mouth in mouths]
+    return found
 
 
 _error = operator.attrgetter("error")

@@ -24,7 +24,8 @@ import scipy.sparse
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from refref_jax.optics.interface_rules import NO_PARENT, nested
+from refref_jax.optics.interface_rules import NO_PARENT
+from refref_jax.optics.media import Interfaces
 from refref_jax.reconstruct import ReconstructionError, relief, walls
 from refref_jax.reconstruct.contents import (
     FINE,
@@ -32,7 +33,9 @@ from refref_jax.reconstruct.contents import (
     Detail,
     Interior,
     Layout,
+    Medium,
     Solid,
+    interfaces_of,
     media_of,
 )
 from refref_jax.reconstruct.families import Revolution, place, place_raised
@@ -170,8 +173,7 @@ class Vessel:
         rows = np.clip(
             np.searchsorted(self.outer_wall.at, dense[nearest]), 0, len(self.outer_wall.at) - 1
         )
-        empty = np.zeros((len(points), 0))
-        return Limits(inward, outward, empty, width), rows
+        return Limits(inward, outward, np.zeros((len(points), 0)), width), rows
 
     def _heights(self) -> tuple[float, float]:
         """Returns the lowest level, and the highest place where the air may begin."""
@@ -275,23 +277,24 @@ class Vessel:
 
     def pose(self, x: Float[np.ndarray, " unknowns"]) -> Candidate:
         """Returns the vessel at given unknowns."""
-        kinds = self._kinds()
-        kinds += ["air"] * (_PARTS - len(kinds))
-        of_kinds = media_of(self.interior(x), self.layout)
-        media = [of_kinds[kind] for kind in kinds]
-        interfaces = nested(
-            [medium.index for medium in media],
-            [NO_PARENT] + [0] * (len(media) - 1),
-            tints=[medium.tint for medium in media],
-            absorptions=[medium.absorption for medium in media],
-        )
+        media = self._media(x)
         return Candidate(
             tuple(self._surfaces(x)),
-            interfaces,
+            self.interfaces(x),
             _selected([medium.index_at for medium in media], 1, len(x)),
             _selected([medium.tint_at for medium in media], 3, len(x)),
             _selected([medium.absorption_at for medium in media], 3, len(x)),
         )
+
+    def interfaces(self, x: Float[np.ndarray, " unknowns"]) -> Interfaces:
+        """Returns the interfaces of the parts at given unknowns."""
+        return interfaces_of(self._media(x))
+
+    def _media(self, x: Float[np.ndarray, " unknowns"]) -> list[Medium]:
+        """Returns the medium of each part, and of those without faces."""
+        kinds = self._kinds()
+        of_kinds = media_of(self.interior(x), self.layout)
+        return [of_kinds[kind] for kind in kinds + ["air"] * (_PARTS - len(kinds))]
 
     def _kinds(self) -> list[str]:
         """Returns the material of each part."""

@@ -28,7 +28,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax import numerics
-from refref_jax.compilation import at_once, jit_quickly
+from refref_jax.compilation import at_once, jit_quickly, traced_once
 from refref_jax.geometry import bvh_build
 from refref_jax.geometry.bvh import NO_PRIMITIVE
 from refref_jax.geometry.bvh_build import Division
@@ -283,18 +283,18 @@ def sensitivities(
 
 
 def residuals(
-    predicted: Float[np.ndarray, "rays 3"], rgb: Float[np.ndarray, "rays 3"]
-) -> Float[np.ndarray, "rays 3"]:
-    """Returns the errors of predicted pixels in sRGB."""
+    predicted: Float[np.ndarray, "*predictions rays 3"], rgb: Float[np.ndarray, "rays 3"]
+) -> Float[np.ndarray, "*predictions rays 3"]:
+    """Returns the errors of predicted pixels in sRGB, for each of several predictions."""
     return encode(predicted) - rgb
 
 
-def encode(linear: Float[np.ndarray, "rays 3"]) -> Float[np.ndarray, "rays 3"]:
+def encode(linear: Float[np.ndarray, "*rays 3"]) -> Float[np.ndarray, "*rays 3"]:
     """Returns linear RGB as sRGB in `[0, 1]`."""
     return np.asarray(_encode(linear), np.float64)
 
 
-def _encode(linear: Float[ArrayLike, "rays 3"]) -> Float[Array, "rays 3"]:
+def _encode(linear: Float[ArrayLike, "*rays 3"]) -> Float[Array, "*rays 3"]:
     return jnp.clip(pixels.linear_to_srgb(jnp.asarray(linear)), 0.0, 1.0)
 
 
@@ -310,6 +310,7 @@ def _in_tiles(render: Callable[[Rays], _Tree], rays: Rays) -> _Tree:
     return images.join(at_once(see, range(0, count, _TILE)))
 
 
+@traced_once
 @functools.partial(jit_quickly, static_argnames=("domain", "resolution"))
 def _predict(
     scene: Scene, mips: Mips, rays: Rays, *, domain: Domain, resolution: int
@@ -324,6 +325,7 @@ def _predict(
     return Prediction(linear, jnp.max(traced.dropped, axis=-1))
 
 
+@traced_once
 @functools.partial(jit_quickly, static_argnames=("domain", "resolution"))
 def _differentiate(
     scene: Scene, mips: Mips, coverage: Mips, rays: Rays, *, domain: Domain, resolution: int

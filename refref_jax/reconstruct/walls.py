@@ -8,6 +8,7 @@ of a liquid does. `inset` returns the wall inside another one, at a distance fro
 Source: ours.
 """
 
+import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -35,6 +36,9 @@ _STEPS, _CELLS = 600, 300
 
 # Empty cells around a section.
 _MARGIN = 4
+
+# Number of profiles whose depths are kept.
+_KEPT = 8
 
 # Smoothing of a profile that was inset, and of the turns that attract points, in steps.
 _SMOOTHING, _TURNS = 3.0, 4.0
@@ -376,27 +380,17 @@ def inset(
     """
     if profile.closed:
         raise ReconstructionError("A ring has no inside that the axis meets. Pass a vessel.")
-    cell = size / _CELLS
-    dense = even(profile.points, 4 * _STEPS)
-    low, high = dense[:, 1].min(), dense[:, 1].max()
-    bottom = float(low) - _MARGIN * cell
-    rows = int((high - bottom) / cell) + 2 * _MARGIN
-    columns = int(dense[:, 0].max() / cell) + 2 * _MARGIN
-    row, column = np.mgrid[:rows, :columns]
-    centres = np.stack([(column + 0.5) * cell, bottom + (row + 0.5) * cell], axis=-1)
-    away, nearest = KDTree(dense).query(centres.reshape(-1, 2))
-    outwards = centres.reshape(-1, 2) - dense[nearest]
-    normals = profile_normals(Profile(dense, closed=False))[nearest]
-    depth = np.where(np.sum(outwards * normals, axis=-1) < 0.0, away, -away) - distance
-    heights = centres[..., 1].ravel()
+    depth, heights = _depths(profile.points.astype(np.float64).tobytes(), size)
+    depth = depth - distance
     if base > 0.0:
-        depth = np.minimum(depth, heights - dense[0, 1] - base)
+        depth = np.minimum(depth, heights - profile.points[0, 1] - base)
     if lid > 0.0:
-        depth = np.minimum(depth, dense[-1, 1] - lid - heights)
-    shares = np.clip(0.5 + depth / (8.0 * cell), 0.0, 1.0).reshape(rows, columns)
+        depth = np.minimum(depth, profile.points[-1, 1] - lid - heights)
+    cell = size / _CELLS
+    shares = np.clip(0.5 + depth / (8.0 * cell), 0.0, 1.0)
     if shares.max() < 0.6:
         return None
-    found = outline(Section(shares, bottom, cell))
+    found = outline(Section(shares, heights[0, 0] - 0.5 * cell, cell))
     if found is None or found.closed:
         return None
     points = even(found.points, _STEPS)
@@ -404,6 +398,31 @@ def inset(
     points = gaussian_filter1d(loop, _SMOOTHING, axis=0, mode="wrap")[: len(points)]
     points[[0, -1], 0] = 0.0
     return Profile(points, closed=False)
+
+
+@functools.lru_cache(maxsize=_KEPT)
+def _depths(
+    points: bytes, size: float
+) -> tuple[Float[np.ndarray, "rows columns"], Float[np.ndarray, "rows 1"]]:
+    """Returns depths inside a profile at the centres of cells, and the height of each row.
+
+    Many vessels with one outer wall share them: they are most of the work of `inset`.
+
+    Args:
+      points: points of the profile, as bytes.
+      size: diameter of the object.
+    """
+    cell = size / _CELLS
+    dense = even(np.frombuffer(points).reshape(-1, 2), 4 * _STEPS)
+    bottom = float(dense[:, 1].min()) - _MARGIN * cell
+    rows = int((dense[:, 1].max() - bottom) / cell) + 2 * _MARGIN
+    columns = int(dense[:, 0].max() / cell) + 2 * _MARGIN
+    row, column = np.mgrid[:rows, :columns]
+    centres = np.stack([(column + 0.5) * cell, bottom + (row + 0.5) * cell], axis=-1)
+    away, nearest = KDTree(dense).query(centres)
+    normals = profile_normals(Profile(dense, closed=False))
+    within = np.sum((centres - dense[nearest]) * normals[nearest], axis=-1) < 0.0
+    return np.where(within, away, -away), centres[:, :1, 1].copy()
 
 
 def with_open_top(profile: Profile, height: float) -> Profile:

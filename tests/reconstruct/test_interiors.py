@@ -25,6 +25,7 @@ from refref_jax.reconstruct.interior_search import (
     _finding,
     _looked_again,
     _simplest,
+    _with_further_steps,
     _with_other_levels,
 )
 from refref_jax.reconstruct.interiors import Vessel
@@ -341,6 +342,32 @@ def test_the_best_finding_is_fitted_once_more_from_other_levels(body):
     assert _better(finding, other) is other  # of another kind
     worse = Finding(vessel, types.SimpleNamespace(fit=finding.trial.fit, error=0.2))
     assert _better(worse, finding) is _better(finding, worse) is finding
+
+
+def test_only_findings_near_the_best_one_take_further_steps(body):
+    vessel, said, shares = Vessel(body, _FLASK, _TINY), [], []
+
+    def say(share, text):
+        shares.append(share)
+        said.append(text)
+
+    def finding(error):
+        x = vessel.start()
+        fit = gauss_newton.Fit(x, np.eye(len(x)), ())
+        return Finding(vessel, types.SimpleNamespace(fit=fit, error=error))
+
+    def fitted(settings, its_vessel, x, blurs):
+        assert its_vessel is vessel and len(x) == vessel.layout.count and blurs == (1, 0)
+        return finding(0.05)
+
+    findings = [finding(0.3), finding(0.1), finding(0.104)]
+    settings = SearchSettings(last=(1, 0), close=1.05)
+    found = _with_further_steps(findings, fitted, settings, say)
+    assert [each.error for each in found] == [0.3, 0.05, 0.05] and found[0] is findings[0]
+    assert said == ["liquid and air: further steps, error 0.0500"] * 2
+    np.testing.assert_allclose(shares, [0.8, 0.85])
+    none = SearchSettings(last=())
+    assert _with_further_steps(findings, fitted, none, say) == findings
 
 
 @pytest.mark.slow
