@@ -63,7 +63,8 @@ class SearchSettings:
         fitted once more; walls can hide a wrong level.
       last: blurs of the further steps of the best findings.
       finest: blurs of the final steps of the best finding, if its outside has ridges or a relief.
-      rays: number of pixels that judge a step; steps of the few numbers take half as many.
+      rays: number of pixels that judge a step of all unknowns; steps of the few numbers take half
+        as many, and are judged by half as many.
       last_rays: number of pixels of a step of all unknowns; twice as many of the finest steps.
       rivals: hypotheses whose error is above that of the best by more than this factor are left
         out before all unknowns are fitted.

@@ -195,7 +195,7 @@ def search(
     report = _reporter(say, _LOOKED, _ROUGH, len(few))
     first = functools.partial(_few_fitted, outer, surface, pixels, judges, settings)
     rivals = _best_of_kinds(_fit_each(first, few, "first steps", report), settings)
-    report = _reporter(say, _ROUGH, _AGAIN, len(settings.mouths) * len(rivals))
+    report = _reporter(say, _ROUGH, _AGAIN, len(_with_each_mouth(rivals, settings)))
     again = _looked_again(outer, rivals, surface, pixels, settings, report=report)
     again = again or [each.vessel.interior_at_start for each in rivals]
     fitted = functools.partial(_fitted, surface, pixels, judges, outlines)
@@ -205,6 +205,7 @@ def search(
 
     report = _reporter(say, _AGAIN, _ALL, len(again) + len(settings.level_shifts))
     vessels = [Vessel(outer, interior, detail._replace(fine=False)) for interior in again]
+    vessels.sort(key=lambda each: each.layout.count)
     findings = _fit_each(fit_all, vessels, "all unknowns", report)
     others = _with_other_levels(min(findings, key=_error), settings)
     for moved in _fit_each(fit_all, others, "another level", report):
@@ -324,7 +325,8 @@ def _few_fitted(
         columns.append(one[:, layout.inner].sum(axis=1))
     columns += list(one[:, layout.inner.stop :].T)
     few = Few(vessel, x, np.stack(columns, axis=1))
-    steps = Steps(settings.few, settings.rays // 2, settings.rays, _OUTLIERS, seed=settings.seed)
+    half = settings.rays // 2
+    steps = Steps(settings.few, half, half, _OUTLIERS, seed=settings.seed)
     fit = gauss_newton.fit(few, few.start(), surface, pixels, settings=steps)
     covariance = few.directions @ fit.covariance @ few.directions.T
     whole = Fit(few.whole(fit.x), covariance, fit.steps)
@@ -409,24 +411,25 @@ def _looked_again(
             report(f"{best.interior.name}: looked again, error {best.error:.4f}")
         return best
 
-    kept: dict[str, Look] = {}
-    for at in _with_each_mouth(findings, settings):
-        look = look_again(at)
-        if look.error < math.inf:
-            name = look.interior.name
-            kept[name] = min(kept.get(name, look), look, key=_error)
-    least = min((each.error for each in kept.values()), default=math.inf)
-    return [each.interior for each in kept.values() if each.error <= settings.rivals * least]
+    looks = [look_again(at) for at in _with_each_mouth(findings, settings)]
+    least = min((each.error for each in looks), default=math.inf)
+    kept = [each for each in looks if each.error <= settings.rivals * least < math.inf]
+    return [each.interior for each in kept]
 
 
 def _with_each_mouth(findings: Sequence[Finding], settings: SearchSettings) -> list[Interior]:
-    """Returns the interiors of findings, closed and open if they may be."""
-    found = []
-    for at in map(_with_wall, findings):
+    """Returns the interiors of findings, closed and open if they may be.
+
+    Of findings that differ in their mouth, only the better one counts.
+    """
+    found: dict[str, Interior] = {}
+    for finding in sorted(findings, key=_error):
+        at = _with_wall(finding)
         may_be_open = at.contents in ("air", "liquid and air")
-        mouths = sorted({at.mouth, *settings.mouths}) if may_be_open else [False]
-        found += [dataclasses.replace(at, mouth=mouth) for mouth in mouths]
-    return found
+        for mouth in sorted({at.mouth, *settings.mouths}) if may_be_open else [False]:
+            other = dataclasses.replace(at, mouth=mouth)
+            found.setdefault(other.name, other)
+    return list(found.values())
 
 
 _error = operator.attrgetter("error")
