@@ -255,10 +255,10 @@ def at_once(function: Callable[..., _Result], *each: Sequence[Any]) -> list[_Res
 
 
 def traced_once(program: Callable[..., _Result]) -> Callable[..., _Result]:
-    """Wraps a jitted program so that threads that call it for the first time trace it once.
+    """Wraps a jitted program so that it is traced once if several threads call it at first.
 
-    JAX would trace and compile it in each of them. Here the others wait, for each kind of
-    arguments.
+    JAX would trace and compile it in each of them. Here one does, for each kind of arguments, and
+    the others wait.
 
     Args:
       program: jitted function; its static arguments can be hashed.

@@ -234,8 +234,8 @@ class FieldSize(NamedTuple):
       multisamples: number of multisamples per interval.
       footprint: pixel footprint along a path, see `ModelConfig`.
       dilation: widening of a proposal before it is sampled, see `ModelConfig`.
-      background_samples: as `samples`, for paths with nothing in front of the wall that they end
-        on; `None` if fewer were not tried.
+      background_samples: number of samples, as `samples`, for paths with nothing in front of the
+        wall that they end on; `None` if fewer were not tried.
     """
 
     field: RadianceConfig

@@ -362,8 +362,8 @@ def build(
 def filled_up(bvh: BVH) -> BVH:
     """Returns the same tree with rows that are never read, up to powers of two.
 
-    Trees of similar meshes differ in size: programs that were compiled for one of them, which takes
-    longer than a step of a fit, then serve all.
+    Trees of similar meshes differ in size. With powers of two, a program that was compiled for one
+    of them serves the others; compiling takes longer than a step of a fit.
     """
     tables, rows = _filled(np.asarray(bvh.nodes), axis=1), bvh.nodes.shape[1]
     octants = np.arange(OCTANTS, dtype=np.int32)[:, None]
@@ -383,7 +383,7 @@ def _filled(rows: np.ndarray, axis: int = 0) -> np.ndarray:
 
 
 def spare_rows(count: int) -> int:
-    """Returns how many rows `filled_up` adds to a table of some, up to a power of two."""
+    """Returns how many rows `filled_up` adds to this many, up to a power of two."""
     return max(_FEWEST_ROWS, 1 << (count - 1).bit_length()) - count
 
 

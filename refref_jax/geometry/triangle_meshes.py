@@ -123,7 +123,7 @@ def average_normals(
     Args:
       normals: unit normals of the faces; zero for degenerate ones.
       groups: numbers of the groups, from `smooth_groups`.
-      weights: not negative; only their ratios within a group matter.
+      weights: weights, not negative; only their ratios within a group matter.
     """
     at = groups.reshape(-1)
     weighted = (weights[..., None] * normals[:, None]).reshape(-1, 3)

@@ -280,7 +280,7 @@ class Vessel:
         media = self._media(x)
         return Candidate(
             tuple(self._surfaces(x)),
-            self.interfaces(x),
+            interfaces_of(media),
             _selected([medium.index_at for medium in media], 1, len(x)),
             _selected([medium.tint_at for medium in media], 3, len(x)),
             _selected([medium.absorption_at for medium in media], 3, len(x)),

@@ -194,7 +194,7 @@ class _Front(NamedTuple):
     Attributes:
       entry: next entry of the list, or next chunk of all lists.
       passing: product of `1 - alpha` of all entries before.
-      sums: red, green, blue, transmittance of the blended ones, and both depths.
+      sums: sums of red, green, blue, transmittance of the blended ones, and both depths.
     """
 
     entry: Int[Array, ""]
@@ -333,7 +333,7 @@ class _Derivatives(NamedTuple):
     """Derivatives of the loss with respect to the result of each pixel.
 
     Attributes:
-      colours: with respect to red, green and blue.
+      colours: derivatives with respect to red, green and blue.
       total: `S` of the module's docstring.
     """
 

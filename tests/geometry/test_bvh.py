@@ -199,6 +199,11 @@ def test_the_spare_rows_of_a_tree_lead_to_its_end(faces):
     assert np.all(nodes[..., 6][~spare] <= last[~spare])
 
 
+@pytest.mark.parametrize("rows, spare", [(1, 4095), (4096, 0), (4097, 4095), (19_456, 13_312)])
+def test_tables_are_filled_up_to_powers_of_two(rows, spare):
+    assert bvh_build.spare_rows(rows) == spare
+
+
 def test_meshes_of_similar_size_have_trees_of_the_same_shape():
     sizes = {
         jax.tree.map(np.shape, bvh_build.filled_up(bvh_build.build(np.float32(_soup(n)))[0]))

@@ -25,6 +25,7 @@ from refref_jax.reconstruct.interior_search import (
     _finding,
     _looked_again,
     _simplest,
+    _with_each_mouth,
     _with_further_steps,
     _with_other_levels,
 )
@@ -368,6 +369,35 @@ def test_only_findings_near_the_best_one_take_further_steps(body):
     np.testing.assert_allclose(shares, [0.8, 0.85])
     none = SearchSettings(last=())
     assert _with_further_steps(findings, fitted, none, say) == findings
+
+
+def test_the_better_of_two_mouths_is_looked_at_again_with_both(body):
+    def finding(interior, error):
+        vessel = Vessel(body, interior, _TINY)
+        x = vessel.start()
+        fit = gauss_newton.Fit(x, np.eye(len(x)), ())
+        return Finding(vessel, types.SimpleNamespace(fit=fit, error=error))
+
+    closed = finding(_FLASK, 0.2)
+    opened = finding(dataclasses.replace(_FLASK, level=-0.3, mouth=True), 0.1)
+    full = finding(Interior("liquid", wall=0.12), 0.3)
+    found = _with_each_mouth([closed, opened, full], SearchSettings())
+    assert [each.name for each in found] == ["liquid and air", "liquid and air, open", "liquid"]
+    np.testing.assert_allclose([each.level for each in found[:2]], -0.3, atol=1e-9)
+    (only,) = _with_each_mouth([closed], SearchSettings(mouths=(False,)))
+    assert (only.mouth, only.level) == (False, _FLASK.level)
+
+
+def test_the_best_tint_of_each_channel_is_found():
+    generator = np.random.default_rng(0)
+    linear = generator.uniform(0.2, 0.9, (60, 3))
+    crossings = generator.uniform(0.0, 4.0, (60, 3))
+    log_tint = interior_looks._LOG_TINTS[[3, 20, 70]]
+    rgb = photometry.encode(linear * np.exp(log_tint * crossings))
+    np.testing.assert_array_equal(interior_looks._best_tint(linear, crossings, rgb), log_tint)
+    # Pixels that something else explains have no say beyond the cap.
+    rgb[:10] = 1.0
+    np.testing.assert_array_equal(interior_looks._best_tint(linear, crossings, rgb), log_tint)
 
 
 @pytest.mark.slow
