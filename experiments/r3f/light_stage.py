@@ -106,7 +106,8 @@ class RevolvedObject(NamedTuple):
     """The object as a body of revolution.
 
     Attributes:
-      outer: its outer surface; `None` if it is no such body.
+      outer: its outer surface; `None` if it is no such body, or a ring, which has no ends and holds
+        nothing.
       ends: its opaque ends.
     """
 
@@ -278,9 +279,9 @@ def read_views(scene: Path) -> Views:
 def look_at_ends(
     scene: Path, mesh: Mesh, surface: Backdrop, seen: Seen, *, seed: int
 ) -> RevolvedObject:
-    """Returns the object as a body of revolution, if it is one, with its opaque ends."""
+    """Returns the object as a body of revolution with its opaque ends, if it meets its axis."""
     outer = families.fit_revolution(mesh, furthest=_FURTHEST)
-    if outer is None:
+    if outer is None or outer.closed:
         return RevolvedObject(None)
     relief = measure_relief(mesh, outer.axis)
     outer = fit_profile(outer, read_views(scene), relief=relief, seed=seed)
@@ -383,7 +384,7 @@ def _with_bar(
 
 def _may_be_vessel(outer: Revolution | None, trials: Sequence[Trial]) -> bool:
     """Returns whether no solid shape explains the pixels of an object that may be a vessel."""
-    return outer is not None and not outer.closed and _is_unexplained(trials)
+    return outer is not None and _is_unexplained(trials)
 
 
 def _is_unexplained(trials: Sequence[Trial]) -> bool:

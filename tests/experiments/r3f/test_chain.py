@@ -5,10 +5,12 @@ import functools
 import json
 import shutil
 import sys
+from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
 import pytest
+import trimesh
 
 from experiments.r3f import (
     chain,
@@ -23,7 +25,7 @@ from experiments.r3f import (
 )
 from experiments.r3f.records import ReconstructionConfig
 from refref_jax.data import meshes, scene_folder
-from refref_jax.geometry.triangle_meshes import corner_normals
+from refref_jax.geometry.triangle_meshes import corner_normals, make_mesh
 from refref_jax.reconstruct import opaque_ends
 from refref_jax.reconstruct.bubbles import Bubble, ObjectWithBubbles
 from refref_jax.reconstruct.contents import COARSE, Interior
@@ -459,6 +461,14 @@ def test_opaque_ends_are_parts_of_vessels_alone(scene, monkeypatch, tmp_path, is
     np.testing.assert_allclose(part.radiance, np.broadcast_to(colour, part.radiance.shape))
     glass = meshes.read_part(target.parent / files[0], index=1.5)
     assert glass.vertices[:, 2].max() < part.vertices[:, 2].min()
+
+
+def test_a_ring_has_no_ends_and_holds_nothing(monkeypatch):
+    ring = trimesh.creation.torus(1.0, 0.4, major_sections=64, minor_sections=32)
+    mesh = make_mesh(ring.vertices, ring.faces)
+    monkeypatch.setattr(light_stage, "fit_profile", None)  # would raise
+    found = light_stage.look_at_ends(Path("nowhere"), mesh, None, None, seed=0)
+    assert found.outer is None and found.ends == ()
 
 
 @pytest.mark.parametrize(("after", "doubted"), [(0.03, False), (0.09, True)])
