@@ -1,4 +1,4 @@
-"""Closed triangle meshes: their shading normals, measures and connected pieces (NumPy only).
+"""Closed triangle meshes: their shading normals, measures, sections and pieces (NumPy only).
 
 Neighbouring faces whose normals differ by less than the crease angle belong to one smooth patch.
 At a corner, the face normals of a patch are averaged with Max's weights, which are exact where all
@@ -278,6 +278,45 @@ def face_vectors(vertices: Vertices, faces: Faces) -> Float[np.ndarray, "faces 3
     """Returns the faces' normals, each as long as the area of its face."""
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     return 0.5 * np.cross(b - a, c - a)
+
+
+def slice_faces(
+    vertices: Vertices, faces: Faces, bottom: float, step: float
+) -> tuple[Float[np.ndarray, "cuts 2"], Float[np.ndarray, "cuts 2"], Int[np.ndarray, " cuts"]]:
+    """Cuts faces by the horizontal planes at heights `bottom + (level + 0.5) step`.
+
+    Returns:
+      Both ends of each cut in its plane, such that the body is to the left; its level.
+    """
+    order = np.argsort(vertices[faces, 2], axis=1)
+    corners = np.take_along_axis(vertices[faces], order[..., None], axis=1)
+    heights = (corners[..., 2] - bottom) / step - 0.5
+    first = np.ceil(heights[:, 0]).astype(np.int64)
+    counts = np.ceil(heights[:, 2]).astype(np.int64) - first
+    face = np.repeat(np.arange(len(faces)), counts)
+    level = np.arange(len(face)) - np.repeat(np.cumsum(counts) - counts, counts) + first[face]
+    corners, heights = corners[face, :, :2], heights[face]
+    lower = level < heights[:, 1]
+    across = _on_edge(corners, heights, level, np.where(lower, 0, 1), np.where(lower, 1, 2))
+    along = _on_edge(corners, heights, level, np.zeros_like(level), np.full_like(level, 2))
+    outward = face_vectors(vertices, faces)[face]
+    way = across - along
+    swap = (outward[:, 0] * way[:, 1] < outward[:, 1] * way[:, 0])[:, None]
+    return np.where(swap, across, along), np.where(swap, along, across), level
+
+
+def _on_edge(
+    corners: Float[np.ndarray, "cuts 3 2"],
+    heights: Float[np.ndarray, "cuts 3"],
+    level: Int[np.ndarray, " cuts"],
+    low: Int[np.ndarray, " cuts"],
+    high: Int[np.ndarray, " cuts"],
+) -> Float[np.ndarray, "cuts 2"]:
+    """Returns the points of edges at a height."""
+    cut = np.arange(len(level))
+    start, rise = heights[cut, low], heights[cut, high] - heights[cut, low]
+    share = np.divide(level - start, rise, out=np.zeros_like(rise), where=rise > 0.0)[:, None]
+    return (1.0 - share) * corners[cut, low] + share * corners[cut, high]
 
 
 def vertex_vectors(vertices: Vertices, faces: Faces) -> Vertices:

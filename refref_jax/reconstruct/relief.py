@@ -23,13 +23,16 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.sparse import csr_array, diags_array, eye_array, kron
 from scipy.sparse.linalg import spsolve
 
-from refref_jax.geometry.triangle_meshes import Mesh, diameter
+from refref_jax.geometry.triangle_meshes import Mesh, diameter, slice_faces
 from refref_jax.reconstruct.gauss_newton import Rows
-from refref_jax.reconstruct.revolution import Axis, slice_faces
+from refref_jax.reconstruct.revolution import Axis
 from refref_jax.reconstruct.shapes import Posed
 
 # Sections, azimuths, and the standard deviation of the smoothing along the axis, in sections.
 _SECTIONS, _AZIMUTHS, _SMOOTHING = 120, 96, 1.0
+
+# Slices through a section.
+_SLICES = 3
 
 # Standard deviation of the radii of a section that is noise of a mesh from masks, as a share of the
 # diameter.
@@ -366,7 +369,8 @@ def _outermost(
     local = (mesh.vertices - axis.point) @ axis.frame
     low, high = local[:, 2].min(), local[:, 2].max()
     step = (high - low) / _SECTIONS
-    start, end, row = slice_faces(local, mesh.faces, low, step)
+    start, end, level = slice_faces(local, mesh.faces, low, step / _SLICES)
+    row = level // _SLICES
     first, count = _azimuths_between(start, end)
     piece = np.repeat(np.arange(len(row)), count)
     number = np.arange(len(piece)) - np.repeat(np.cumsum(count) - count, count) + first[piece]

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 from scipy.spatial import KDTree
 
-from refref_jax.geometry.triangle_meshes import Mesh, face_vectors
+from refref_jax.geometry.triangle_meshes import Mesh, slice_faces
 from refref_jax.reconstruct.grids import import_skimage
 from refref_jax.reconstruct.shapes import Cloud, Frame, frame_along, robust_weights
 
@@ -262,7 +262,8 @@ def section(mesh: Mesh, axis: Axis, size: float) -> Section:
     bottom = float(local[:, 2].min()) - _MARGIN * cell
     rows = int((local[:, 2].max() - bottom) / cell) + _MARGIN
     columns = int(np.linalg.norm(local[:, :2], axis=-1).max() / cell) + _MARGIN
-    start, end, row = slice_faces(local, mesh.faces, bottom, cell)
+    start, end, level = slice_faces(local, mesh.faces, bottom, cell / _SLICES)
+    row = level // _SLICES
     total = np.zeros(rows * (columns + 1))
     for piece in range(_PIECES):
         one, two = (start + (piece + i) / _PIECES * (end - start) for i in (0, 1))
@@ -276,48 +277,6 @@ def section(mesh: Mesh, axis: Axis, size: float) -> Section:
         total += np.bincount(at, turns * (1.0 - share), total.size)
     shares = np.cumsum(total.reshape(rows, columns + 1)[:, ::-1], axis=1)[:, ::-1]
     return Section(shares[:, 1:], bottom, cell)
-
-
-def slice_faces(
-    local: Float[np.ndarray, "vertices 3"],
-    faces: Int[np.ndarray, "faces 3"],
-    bottom: float,
-    cell: float,
-) -> tuple[Curve, Curve, Int[np.ndarray, " cuts"]]:
-    """Cuts faces by horizontal planes, several for each row of cells.
-
-    Returns:
-      Both ends of each cut in the plane, such that the body is to the left; its row.
-    """
-    order = np.argsort(local[faces, 2], axis=1)
-    corners = np.take_along_axis(local[faces], order[..., None], axis=1)
-    heights = (corners[..., 2] - bottom) * (_SLICES / cell) - 0.5
-    first = np.ceil(heights[:, 0]).astype(np.int64)
-    counts = np.ceil(heights[:, 2]).astype(np.int64) - first
-    face = np.repeat(np.arange(len(faces)), counts)
-    level = np.arange(len(face)) - np.repeat(np.cumsum(counts) - counts, counts) + first[face]
-    corners, heights = corners[face, :, :2], heights[face]
-    lower = level < heights[:, 1]
-    across = _between(corners, heights, level, np.where(lower, 0, 1), np.where(lower, 1, 2))
-    along = _between(corners, heights, level, np.zeros_like(level), np.full_like(level, 2))
-    outward = face_vectors(local, faces)[face]
-    step = across - along
-    swap = (outward[:, 0] * step[:, 1] < outward[:, 1] * step[:, 0])[:, None]
-    return np.where(swap, across, along), np.where(swap, along, across), level // _SLICES
-
-
-def _between(
-    corners: Float[np.ndarray, "cuts 3 2"],
-    heights: Float[np.ndarray, "cuts 3"],
-    level: Int[np.ndarray, " cuts"],
-    low: Int[np.ndarray, " cuts"],
-    high: Int[np.ndarray, " cuts"],
-) -> Curve:
-    """Returns the points of edges at a height."""
-    cut = np.arange(len(level))
-    start, rise = heights[cut, low], heights[cut, high] - heights[cut, low]
-    share = np.divide(level - start, rise, out=np.zeros_like(rise), where=rise > 0.0)[:, None]
-    return (1.0 - share) * corners[cut, low] + share * corners[cut, high]
 
 
 def outline(section: Section) -> Profile | None:
