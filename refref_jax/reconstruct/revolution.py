@@ -10,12 +10,14 @@ Source: Pottmann and Randrup, Rotational and Helical Surface Approximation for R
 (1998), for the axis. The profile is ours.
 """
 
+import functools
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 from scipy.spatial import KDTree
+from trimesh import Trimesh
 
 from refref_jax.geometry.triangle_meshes import Mesh, slice_faces
 from refref_jax.reconstruct.grids import import_skimage
@@ -26,6 +28,10 @@ Curve = Float[np.ndarray, "points 2"]
 # Rounds of robust weights, of the axis against the profile, and of the profile's corrections.
 _AXIS_ROUNDS = 12
 _CORRECTIONS = 3
+
+# Rms distance of a body around the axis of inertia, as a share of that around the one that normals
+# meet, below which it takes its place.
+_BETTER = 0.9
 
 # Cells of the section along the diameter, and slices through a cell.
 _CELLS = 300
@@ -159,7 +165,24 @@ def find_axis(cloud: Cloud) -> Axis:
         moment = shift @ direction
         error = rows @ np.concatenate([direction, moment])
         weights = cloud.areas * robust_weights(error)
-    point = middle + size * np.cross(direction, moment)
+    return _axis_along(middle + size * np.cross(direction, moment), direction)
+
+
+def axis_of_inertia(mesh: Mesh) -> Axis:
+    """Returns the principal axis of a body about which its other two moments differ least.
+
+    That of a prism or star with at least three like sides is its axis, which the normals of its
+    sides miss. The direction points to the side of the largest coordinate.
+    """
+    body = Trimesh(mesh.vertices, mesh.faces, process=False)
+    moments, directions = np.linalg.eigh(body.moment_inertia)
+    low, high = np.diff(moments)
+    direction = directions[:, 0 if low > high else 2]
+    return _axis_along(body.center_mass, direction)
+
+
+def _axis_along(point: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"]) -> Axis:
+    """Returns the axis through a point, which points to the side of its largest coordinate."""
     return Axis(point, frame_along(direction * np.sign(direction[np.argmax(np.abs(direction))])))
 
 
@@ -206,7 +229,8 @@ def fit_axis_and_profile(mesh: Mesh, cloud: Cloud, size: float, *, rounds: int =
       mesh: closed mesh.
       cloud: samples of it.
       size: diameter of the mesh, world units.
-      rounds: number of times that the axis is found; each but the first corrects it.
+      rounds: number of times that the axis is found; each but the first corrects it. It is the
+        line that most normals meet, or else the axis of inertia, which needs no correction.
 
     Returns:
       The fit, however bad; `None` if no circle around the axis is mostly inside the mesh.
@@ -214,7 +238,19 @@ def fit_axis_and_profile(mesh: Mesh, cloud: Cloud, size: float, *, rounds: int =
     Raises:
       ReconstructionError: if scikit-image is not installed.
     """
-    axis, smoothing = find_axis(cloud), _LEAST_SMOOTHING * size
+    fitted = functools.partial(_fit_from, mesh, cloud, size, rounds)
+    by_normals = fitted(find_axis(cloud), fixed=False)
+    by_inertia = fitted(axis_of_inertia(mesh), fixed=True)
+    if by_normals is None or by_inertia is None:
+        return by_normals or by_inertia
+    return by_inertia if by_inertia.rms < _BETTER * by_normals.rms else by_normals
+
+
+def _fit_from(
+    mesh: Mesh, cloud: Cloud, size: float, rounds: int, axis: Axis, *, fixed: bool
+) -> Fit | None:
+    """Returns the fit that begins with an axis, which stays as it is if it is fixed."""
+    smoothing = _LEAST_SMOOTHING * size
     for last in range(rounds - 1, -1, -1):
         contour = outline(section(mesh, axis, size))
         if contour is None:
@@ -225,7 +261,7 @@ def fit_axis_and_profile(mesh: Mesh, cloud: Cloud, size: float, *, rounds: int =
             profile = _corrected(profile, matched, smoothing, size)
         matched = _match(profile, axis, cloud, size)
         if last:
-            axis = _corrected_axis(axis, matched, size)
+            axis = axis if fixed else _corrected_axis(axis, matched, size)
             error = float(np.median(np.abs(matched.errors))) * 1.48
             least, most = _LEAST_SMOOTHING * size, _MOST_SMOOTHING * size
             smoothing = float(np.clip(_SMOOTHING * error, least, most))

@@ -19,6 +19,7 @@ from refref_jax.reconstruct.polyhedra import fit_polyhedron, with_right_angles
 from refref_jax.reconstruct.revolution import (
     Axis,
     Profile,
+    axis_of_inertia,
     find_axis,
     lathe,
     outline,
@@ -229,6 +230,20 @@ def test_the_axis_of_a_cone_by_hand():
     axis = find_axis(cloud_of(revolved.placed(cone, offset=np.array([1.0, 2.0, 3.0]))))
     assert np.allclose(axis.frame[:, 2], [0.0, 0.0, 1.0], atol=1e-6)
     assert np.allclose(axis.point[:2], [1.0, 2.0], atol=1e-6)
+
+
+@pytest.mark.parametrize("sides", [3, 5])
+def test_the_axis_of_a_star_is_that_of_inertia(sides):
+    bottle = revolved.revolve(
+        revolved.even([[0.0, 0.0], [1.0, 0.0], [1.0, 2.0], [0.4, 2.4], [0.4, 3.0], [0.0, 3.0]], 150)
+    )
+    x, y, z = bottle.vertices.T
+    factor = 1.0 + 0.3 * np.cos(sides * np.arctan2(y, x)) * np.clip((2.6 - z) / 0.6, 0.0, 1.0)
+    star = make_mesh(np.stack([factor * x, factor * y, z], axis=-1), bottle.faces)
+    star = revolved.noisy(star, 0.005)
+    assert axis_of_inertia(star).frame[2, 2] == pytest.approx(1.0, abs=1e-6)
+    found = fit_revolution(star, furthest=0.1)
+    assert np.degrees(np.arccos(found.axis.frame[2, 2])) < 1.0
 
 
 def test_a_section_measures_shares_of_circles():
