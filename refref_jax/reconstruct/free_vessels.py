@@ -43,7 +43,7 @@ _ROUGHNESS, _OFFSET = 0.006, 0.04
 _WALLS, _BASES, _PIXELS, _BLUR = (0.008, 0.014, 0.022, 0.035, 0.055), (0.0, 0.045), 3000, 1
 
 # Blurs of the first steps, which choose the contents, and of the others; number of pixels of each.
-_FIRST, _OTHERS = (2, 2, 1), (1, 0, 0, 0, 0, 0, 0, 0)
+_FIRST, _OTHERS = (2, 2, 1), (1, *[0] * 15)
 _FIRST_RAYS, _RAYS, _JUDGES = 12_000, 24_000, 8192
 
 # Share of the pixels of largest derivatives that a step leaves out, least scale of the robust

@@ -329,7 +329,7 @@ def _deepest(body: Revolution, x: Unknowns, rays: Rays) -> _Deepest:
         local = (origins[:, None] + t[..., None] * directions[:, None]).reshape(-1, 3) @ tilted
         local = local if body.relief is None else body.relief.shrink(local)
         flat = np.stack([np.hypot(local[:, 0], local[:, 1]), local[:, 2]], axis=-1)
-        nearest = tree.query(flat)[1]
+        nearest = tree.query(flat, workers=-1)[1]
         away = np.sum(normals[nearest] * (flat - points[nearest]), axis=-1)
         return -away.reshape(t.shape), nearest.reshape(t.shape)
 
