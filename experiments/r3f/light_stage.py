@@ -279,7 +279,7 @@ def read_views(scene: Path) -> Views:
 def look_at_ends(
     scene: Path, mesh: Mesh, surface: Backdrop, seen: Seen, *, seed: int
 ) -> RevolvedObject:
-    """Returns the object as a body of revolution with its opaque ends, if it meets its axis."""
+    """Returns the object as a body of revolution with its opaque ends, unless it is a ring."""
     outer = families.fit_revolution(mesh, furthest=_FURTHEST)
     if outer is None or outer.closed:
         return RevolvedObject(None)

@@ -283,7 +283,15 @@ def face_vectors(vertices: Vertices, faces: Faces) -> Float[np.ndarray, "faces 3
 def slice_faces(
     vertices: Vertices, faces: Faces, bottom: float, step: float
 ) -> tuple[Float[np.ndarray, "cuts 2"], Float[np.ndarray, "cuts 2"], Int[np.ndarray, " cuts"]]:
-    """Cuts faces by the horizontal planes at heights `bottom + (level + 0.5) step`.
+    """Cuts faces by the horizontal planes at heights `z = bottom + (level + 0.5) step`.
+
+    Faces in a plane are not cut; their neighbours are, so that closed meshes have closed sections.
+
+    Args:
+      vertices: corners of the faces, world units.
+      faces: faces of a closed mesh.
+      bottom: height half a step below the plane of level 0; planes below it have negative levels.
+      step: distance between planes.
 
     Returns:
       Both ends of each cut in its plane, such that the body is to the left; its level.

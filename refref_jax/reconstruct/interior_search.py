@@ -422,14 +422,14 @@ def _with_each_mouth(findings: Sequence[Finding], settings: SearchSettings) -> l
 
     Of findings that differ in their mouth, only the better one counts.
     """
-    found: dict[str, Interior] = {}
+    found: dict[str, list[Interior]] = {}
     for finding in sorted(findings, key=_error):
         at = _with_wall(finding)
         may_be_open = at.contents in ("air", "liquid and air")
-        for mouth in sorted({at.mouth, *settings.mouths}) if may_be_open else [False]:
-            other = dataclasses.replace(at, mouth=mouth)
-            found.setdefault(other.name, other)
-    return list(found.values())
+        mouths = sorted({at.mouth, *settings.mouths}) if may_be_open else [False]
+        with_mouths = [dataclasses.replace(at, mouth=mouth) for mouth in mouths]
+        found.setdefault(dataclasses.replace(at, mouth=False).name, with_mouths)
+    return [each for group in found.values() for each in group]
 
 
 _error = operator.attrgetter("error")

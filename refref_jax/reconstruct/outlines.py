@@ -27,6 +27,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 from scipy.special import expit
 
+from refref_jax.compilation import threads
 from refref_jax.geometry.cameras import Projection, pixel_rays, project, projection_slopes
 from refref_jax.geometry.rays import Rays
 from refref_jax.reconstruct.families import Revolution
@@ -329,7 +330,7 @@ def _deepest(body: Revolution, x: Unknowns, rays: Rays) -> _Deepest:
         local = (origins[:, None] + t[..., None] * directions[:, None]).reshape(-1, 3) @ tilted
         local = local if body.relief is None else body.relief.shrink(local)
         flat = np.stack([np.hypot(local[:, 0], local[:, 1]), local[:, 2]], axis=-1)
-        nearest = tree.query(flat, workers=-1)[1]
+        nearest = tree.query(flat, workers=threads())[1]
         away = np.sum(normals[nearest] * (flat - points[nearest]), axis=-1)
         return -away.reshape(t.shape), nearest.reshape(t.shape)
 

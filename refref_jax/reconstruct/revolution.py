@@ -10,7 +10,6 @@ Source: Pottmann and Randrup, Rotational and Helical Surface Approximation for R
 (1998), for the axis. The profile is ours.
 """
 
-import functools
 from typing import NamedTuple
 
 import numpy as np
@@ -19,9 +18,9 @@ from scipy.ndimage import gaussian_filter, gaussian_filter1d
 from scipy.spatial import KDTree
 from trimesh import Trimesh
 
-from refref_jax.geometry.triangle_meshes import Mesh, slice_faces
+from refref_jax.geometry.triangle_meshes import Mesh, diameter, slice_faces
 from refref_jax.reconstruct.grids import import_skimage
-from refref_jax.reconstruct.shapes import Cloud, Frame, frame_along, robust_weights
+from refref_jax.reconstruct.shapes import Cloud, Frame, check, frame_along, robust_weights
 
 Curve = Float[np.ndarray, "points 2"]
 
@@ -29,9 +28,9 @@ Curve = Float[np.ndarray, "points 2"]
 _AXIS_ROUNDS = 12
 _CORRECTIONS = 3
 
-# Rms distance of a body around the axis of inertia, as a share of that around the one that normals
-# meet, below which it takes its place.
-_BETTER = 0.9
+# Rms distance of a fit that begins with the axis of inertia, as a share of that of the other one,
+# below which it takes its place.
+_BETTER = 0.99
 
 # Cells of the section along the diameter, and slices through a cell.
 _CELLS = 300
@@ -169,16 +168,21 @@ def find_axis(cloud: Cloud) -> Axis:
 
 
 def axis_of_inertia(mesh: Mesh) -> Axis:
-    """Returns the principal axis of a body about which its other two moments differ least.
+    """Returns the principal axis of a body whose other two moments of inertia are most alike.
 
     That of a prism or star with at least three like sides is its axis, which the normals of its
-    sides miss. The direction points to the side of the largest coordinate.
+    sides may miss. The direction points to the side of the largest coordinate.
+
+    Raises:
+      ReconstructionError: if the mesh is empty, flat, inside out or not finite.
     """
-    body = Trimesh(mesh.vertices, mesh.faces, process=False)
+    check(mesh)
+    middle, size = mesh.vertices.mean(axis=0), diameter(mesh.vertices)
+    body = Trimesh((mesh.vertices - middle) / size, mesh.faces, process=False)
     moments, directions = np.linalg.eigh(body.moment_inertia)
     low, high = np.diff(moments)
     direction = directions[:, 0 if low > high else 2]
-    return _axis_along(body.center_mass, direction)
+    return _axis_along(middle + size * body.center_mass, direction)
 
 
 def _axis_along(point: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"]) -> Axis:
@@ -229,8 +233,8 @@ def fit_axis_and_profile(mesh: Mesh, cloud: Cloud, size: float, *, rounds: int =
       mesh: closed mesh.
       cloud: samples of it.
       size: diameter of the mesh, world units.
-      rounds: number of times that the axis is found; each but the first corrects it. It is the
-        line that most normals meet, or else the axis of inertia, which needs no correction.
+      rounds: number of times that the axis is found; each but the first corrects it. The first one
+        is the line that most normals meet, or the axis of inertia.
 
     Returns:
       The fit, however bad; `None` if no circle around the axis is mostly inside the mesh.
@@ -238,18 +242,15 @@ def fit_axis_and_profile(mesh: Mesh, cloud: Cloud, size: float, *, rounds: int =
     Raises:
       ReconstructionError: if scikit-image is not installed.
     """
-    fitted = functools.partial(_fit_from, mesh, cloud, size, rounds)
-    by_normals = fitted(find_axis(cloud), fixed=False)
-    by_inertia = fitted(axis_of_inertia(mesh), fixed=True)
+    starts = find_axis(cloud), axis_of_inertia(mesh)
+    by_normals, by_inertia = (_fit_from(axis, mesh, cloud, size, rounds) for axis in starts)
     if by_normals is None or by_inertia is None:
         return by_normals or by_inertia
     return by_inertia if by_inertia.rms < _BETTER * by_normals.rms else by_normals
 
 
-def _fit_from(
-    mesh: Mesh, cloud: Cloud, size: float, rounds: int, axis: Axis, *, fixed: bool
-) -> Fit | None:
-    """Returns the fit that begins with an axis, which stays as it is if it is fixed."""
+def _fit_from(axis: Axis, mesh: Mesh, cloud: Cloud, size: float, rounds: int) -> Fit | None:
+    """Returns the fit that begins with an axis."""
     smoothing = _LEAST_SMOOTHING * size
     for last in range(rounds - 1, -1, -1):
         contour = outline(section(mesh, axis, size))
@@ -261,7 +262,7 @@ def _fit_from(
             profile = _corrected(profile, matched, smoothing, size)
         matched = _match(profile, axis, cloud, size)
         if last:
-            axis = axis if fixed else _corrected_axis(axis, matched, size)
+            axis = _corrected_axis(axis, matched, size)
             error = float(np.median(np.abs(matched.errors))) * 1.48
             least, most = _LEAST_SMOOTHING * size, _MOST_SMOOTHING * size
             smoothing = float(np.clip(_SMOOTHING * error, least, most))

@@ -232,18 +232,37 @@ def test_the_axis_of_a_cone_by_hand():
     assert np.allclose(axis.point[:2], [1.0, 2.0], atol=1e-6)
 
 
-@pytest.mark.parametrize("sides", [3, 5])
-def test_the_axis_of_a_star_is_that_of_inertia(sides):
-    bottle = revolved.revolve(
-        revolved.even([[0.0, 0.0], [1.0, 0.0], [1.0, 2.0], [0.4, 2.4], [0.4, 3.0], [0.0, 3.0]], 150)
-    )
-    x, y, z = bottle.vertices.T
-    factor = 1.0 + 0.3 * np.cos(sides * np.arctan2(y, x)) * np.clip((2.6 - z) / 0.6, 0.0, 1.0)
-    star = make_mesh(np.stack([factor * x, factor * y, z], axis=-1), bottle.faces)
-    star = revolved.noisy(star, 0.005)
-    assert axis_of_inertia(star).frame[2, 2] == pytest.approx(1.0, abs=1e-6)
-    found = fit_revolution(star, furthest=0.1)
-    assert np.degrees(np.arccos(found.axis.frame[2, 2])) < 1.0
+def _bottle(*, sides, ridges, lump=0.0):
+    """A bottle with ridges along its sides, and a lump on one of them; the axis is z."""
+    profile = [[0.0, 0.0], [1.0, 0.0], [1.0, 2.0], [0.4, 2.4], [0.4, 3.0], [0.0, 3.0]]
+    round_one = revolved.revolve(revolved.even(profile, 150))
+    x, y, z = round_one.vertices.T
+    azimuth = np.arctan2(y, x)
+    factor = 1.0 + ridges * np.cos(sides * azimuth) * np.clip((2.6 - z) / 0.6, 0.0, 1.0)
+    factor += lump * np.exp(-((azimuth / 0.3) ** 2) - ((z - 1.5) / 0.3) ** 2)
+    vertices = np.stack([factor * x, factor * y, z], axis=-1)
+    return revolved.noisy(make_mesh(vertices, round_one.faces), 0.005)
+
+
+@pytest.mark.parametrize(
+    ("sides", "ridges", "lump", "furthest"),
+    [(5, 0.3, 0.0, 0.04), (5, 0.3, 0.3, 0.04), (5, 0.1, 0.3, 0.03), (3, 0.2, 0.0, 0.03)],
+)
+def test_the_axis_of_a_bottle_with_ridges(sides, ridges, lump, furthest):
+    mesh = _bottle(sides=sides, ridges=ridges, lump=lump)
+    axis = fit_revolution(mesh, furthest=furthest).axis
+    assert np.degrees(np.arccos(axis.frame[2, 2])) < 0.8
+    middle = axis.point + axis.frame[:, 2] * (1.5 - axis.point[2]) / axis.frame[2, 2]
+    assert np.hypot(*middle[:2]) < 0.04
+
+
+def test_the_axis_of_inertia_far_from_the_origin():
+    bottle = _bottle(sides=5, ridges=0.3)
+    near, far = axis_of_inertia(bottle), axis_of_inertia(_far(bottle))
+    np.testing.assert_allclose(far.frame[:, 2] @ _TURN, near.frame[:, 2], atol=1e-9)
+    np.testing.assert_allclose(_from_far(far.point), near.point, atol=1e-9)
+    with pytest.raises(ReconstructionError, match="inwards"):
+        axis_of_inertia(bottle._replace(faces=bottle.faces[:, ::-1]))
 
 
 def test_a_section_measures_shares_of_circles():

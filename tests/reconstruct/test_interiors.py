@@ -386,6 +386,8 @@ def test_the_better_of_two_mouths_is_looked_at_again_with_both(body):
     np.testing.assert_allclose([each.level for each in found[:2]], -0.3, atol=1e-9)
     (only,) = _with_each_mouth([closed], SearchSettings(mouths=(False,)))
     assert (only.mouth, only.level) == (False, _FLASK.level)
+    (only,) = _with_each_mouth([closed, opened], SearchSettings(mouths=()))
+    assert only.mouth
 
 
 def test_the_best_tint_of_each_channel_is_found():

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import scipy.sparse
 import trimesh
 
 from refref_jax.geometry.triangle_meshes import (
@@ -21,6 +22,7 @@ from refref_jax.reconstruct.outlines import Outlines, fit_profile
 from refref_jax.reconstruct.relief import (
     KNOTS,
     Relief,
+    _solve_banded,
     fitted_to_outlines,
     measure_relief,
     precision,
@@ -303,6 +305,16 @@ def test_outlines_decide_about_the_relief():
         wrong.append(np.sqrt(np.mean(_ball_with_six_sides(foot) ** 2)) / 0.6)
     assert wrong[1] < 0.25 * wrong[0]
     assert fit_profile(outer, ball, relief=relief).relief is None
+
+
+@pytest.mark.parametrize("width", [0, 2, 7])
+def test_banded_equations_are_solved(width):
+    generator = np.random.default_rng(0)
+    away = np.abs(np.subtract.outer(np.arange(8), np.arange(8)))
+    lower = np.tril(generator.normal(size=(8, 8)) * (away <= width)) + 4.0 * np.eye(8)
+    matrix, solution = lower @ lower.T, generator.normal(size=8)
+    found = _solve_banded(scipy.sparse.csc_array(matrix), matrix @ solution)
+    np.testing.assert_allclose(found, solution, rtol=1e-10)
 
 
 def _ball_with_six_sides(points):
