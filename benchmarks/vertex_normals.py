@@ -75,7 +75,7 @@ class Errors(NamedTuple):
 
     Attributes:
       vertices: at the corners of the faces.
-      surface: of interpolated normals at random points.
+      surface: errors of interpolated normals at random points.
     """
 
     vertices: tuple[float, float, float]
