@@ -1,4 +1,4 @@
-"""Restores convex meshes, whose edges a grid has cut off (NumPy only).
+"""Restores convex meshes, whose edges a grid has cut off, on the host.
 
 Masks constrain a convex object better than any other, because its surface is the envelope of its
 tangent planes. `from_tangents` intersects these planes, which restores the edges that a grid cuts
@@ -13,9 +13,11 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
+from refref_jax.compilation import at_once
 from refref_jax.geometry.triangle_meshes import (
     CREASE_ANGLE,
     Mesh,
+    Vertices,
     diameter,
     face_normals,
     face_vectors,
@@ -23,7 +25,6 @@ from refref_jax.geometry.triangle_meshes import (
     neighbours,
     volume,
 )
-from refref_jax.reconstruct.mesh_distance import ClosestSearch
 from refref_jax.reconstruct.smoothing import CREASE
 
 FaceIndex = Int[np.ndarray, " pairs"]
@@ -53,6 +54,9 @@ _SAME = 1e-6
 
 # Faces that meet at a smaller angle belong to the same facet, radians.
 _COPLANAR = np.radians(3.0)
+
+# Largest number of distances of vertices from planes that are computed at once.
+_AT_ONCE = 1 << 21
 
 # Share of the volume by which a convex mesh may differ from its hull, because of rounding.
 _ROUNDING = 1e-6
@@ -115,9 +119,18 @@ def is_convex(mesh: Mesh) -> bool:
 
 
 def depth_below_hull(mesh: Mesh) -> float:
-    """Returns how far the deepest vertex lies below the convex hull, in world units."""
-    outer = hull(mesh)
-    return float(ClosestSearch(outer.vertices, outer.faces)(mesh.vertices).distances.max())
+    """Returns how far the deepest vertex lies below the convex hull, in world units.
+
+    From inside a convex body, the nearest plane of its faces is as near as its surface.
+    """
+    planes = np.unique(ConvexHull(mesh.vertices).equations, axis=0)
+    count = max(1, _AT_ONCE // len(planes))
+    some = [mesh.vertices[i : i + count] for i in range(0, len(mesh.vertices), count)]
+
+    def depth(points: Vertices) -> float:
+        return float((-planes[:, 3] - points @ planes[:, :3].T).min(axis=1).max())
+
+    return max(at_once(depth, some))
 
 
 def from_tangents(mesh: Mesh, *, crease_angle: float = CREASE) -> Mesh:

@@ -402,7 +402,7 @@ def _covariance(
     inverse = np.linalg.inv(light.matrix + precision)
     views = light.by_view - light.by_view.mean(axis=0)
     scatter = np.sum((views @ inverse) ** 2, axis=0)
-    independent = np.einsum("ij,jk,ki->i", inverse, light.of_pixels, inverse)
+    independent = np.sum((inverse @ light.of_pixels) * inverse, axis=1)
     alike = float(np.median(scatter / np.maximum(independent, 1e-300)))
     return inverse * max(1.0, alike)
 

@@ -26,6 +26,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 from trimesh.triangles import closest_point, points_to_barycentric
 
+from refref_jax.compilation import threads
 from refref_jax.geometry.cameras import Cameras, image_rays
 from refref_jax.geometry.surfaces import pack_meshes
 from refref_jax.geometry.triangle_meshes import (
@@ -102,7 +103,7 @@ class ClosestSearch:
         self._pieces, owner = _cut(vertices[faces[kept]], _LONGEST_EDGE * diameter(vertices))
         self._owner = kept[owner]
         middles = self._pieces.mean(axis=1)
-        self._radius = float(np.linalg.norm(self._pieces - middles[:, None], axis=-1).max())
+        self._radii = np.linalg.norm(self._pieces - middles[:, None], axis=-1).max(axis=1)
         self._tree = KDTree(middles)
 
     def __call__(self, points: Points) -> ClosestPoints:
@@ -110,13 +111,13 @@ class ClosestSearch:
         found, distance = np.zeros(points.shape), np.full(len(points), np.inf)
         piece = np.zeros(len(points), np.int64)
         left, count = np.arange(len(points)), min(_FIRST, len(self._pieces))
-        most = min(_MOST, len(self._pieces))
+        most, furthest = min(_MOST, len(self._pieces)), self._radii.max()
         while len(left):
             done = []
             step = max(1, _SWEEP // count)
             for some in (left[i : i + step] for i in range(0, len(left), step)):
                 found[some], distance[some], piece[some], reach = self._nearest(points[some], count)
-                beyond = distance[some] + self._radius <= reach
+                beyond = distance[some] + furthest <= reach
                 done.append(beyond | (count == most))
             left = left[~np.concatenate(done)]
             count = min(_GROWTH * count, most)
@@ -132,9 +133,11 @@ class ClosestSearch:
         Returns:
           The points, their distances and pieces, and the distance of the furthest of the centres.
         """
-        away, near = self._tree.query(points, k=[*range(1, count + 1)])
-        corners = self._pieces[near].reshape(-1, 3, 3)
-        on = closest_point(corners, np.repeat(points, count, axis=0)).reshape(-1, count, 3)
+        away, near = self._tree.query(points, k=[*range(1, count + 1)], workers=threads())
+        may_be = away - self._radii[near] <= away[:, :1]  # no triangle is further than its centre
+        row, _ = np.nonzero(may_be)
+        on = np.full((*near.shape, 3), np.inf)
+        on[may_be] = closest_point(self._pieces[near[may_be]], points[row])
         distance = np.linalg.norm(on - points[:, None], axis=-1)
         best = np.argmin(distance, axis=1)
         row = np.arange(len(points))

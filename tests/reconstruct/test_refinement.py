@@ -8,7 +8,7 @@ from refref_jax.geometry.triangle_meshes import Mesh, face_normals, is_closed, m
 from refref_jax.reconstruct import ReconstructionError, convex, refinement, smoothing
 from refref_jax.reconstruct.grids import Box, find_isosurface, sample
 from refref_jax.reconstruct.masks import Views, some_of
-from refref_jax.reconstruct.mesh_distance import compare_meshes, silhouette_overlap
+from refref_jax.reconstruct.mesh_distance import ClosestSearch, compare_meshes, silhouette_overlap
 from refref_jax.reconstruct.refinement import Refinement, keep_pieces, refine
 from refref_jax.reconstruct.smoothing import denoise_within
 from tests.factories import bodies
@@ -117,6 +117,15 @@ def test_depth_below_the_hull_is_known_by_hand():
     # The lowest points of the ring's hole lie 0.4 below the flat lids of its hull.
     assert convex.depth_below_hull(_surface(bodies.torus)) == pytest.approx(0.4, abs=0.02)
     assert convex.depth_below_hull(bodies.icosphere(2)) < 1e-12
+
+
+def test_depths_below_a_hull_are_distances_from_it():
+    dented = bodies.icosphere(4)
+    vertices = dented.vertices * (1.0 - 0.3 * np.exp(-40.0 * (dented.vertices[:, :1] - 0.8) ** 2))
+    hull = convex.hull(dented._replace(vertices=vertices))
+    expected = ClosestSearch(hull.vertices, hull.faces)(vertices).distances.max()
+    found = convex.depth_below_hull(dented._replace(vertices=vertices))
+    assert found == pytest.approx(expected, abs=1e-12) and found > 0.05
 
 
 def test_floaters_go_and_the_largest_piece_stays_whatever_the_share():
