@@ -60,7 +60,8 @@ _POINTS = 100
 _ROUNDS, _RELIEF_ROUNDS, _BEND = 5, 3, 0.001
 
 # Pixels that are nearer to an outline than this are fitted to, in pixels; one view in so many
-# judges; numbers of pixels; and the share of wrong ones below which there are no ridges.
+# judges; numbers of pixels; and the share of wrong ones below which there are
+# neither reliefs nor ridges.
 _BESIDE, _JUDGE_EVERY, _FITTED, _JUDGES, _FEW_WRONG = 1.8, 5, 24_000, 8_000, 0.015
 
 # Scale of the logistic function of a depth, in pixels, and share of the pixels that are wrong.
@@ -204,8 +205,8 @@ def fit_profile(
 ) -> Revolution:
     """Fits a body of revolution to outlines alone.
 
-    It gets a relief, and then narrow ridges such as rings and threads, only if the masks are
-    explained better by them.
+    It gets a relief, and then narrow ridges such as rings and threads, only if some pixels of masks
+    are not explained without them, and if they are explained better.
 
     Args:
       outer: a body near the outlines, such as that of a mesh from masks.
@@ -217,10 +218,13 @@ def fit_profile(
     outlines = Outlines(views, seed=seed)
     fitted, judges = _pixels_beside(views, seed=seed)
     found = _fitted(outer.with_relief(None), outlines)
+    of_single_view = not len(fitted.inside) or not len(judges.inside)
+    if not of_single_view and _judged(found, judges)[0] < _FEW_WRONG:
+        return found
     if relief is not None:
         raised = _best_relief(outer, relief, outlines, judges)
         found = raised if _error(raised, outlines) < _BETTER * _error(found, outlines) else found
-    if not len(fitted.inside) or not len(judges.inside):  # of a single view
+    if of_single_view:
         return found
     wrong, surprise = _judged(found, judges)
     if wrong < _FEW_WRONG:

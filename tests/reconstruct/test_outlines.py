@@ -11,6 +11,7 @@ from refref_jax.reconstruct.families import Revolution, Sphere
 from refref_jax.reconstruct.gauss_newton import Candidate, Equations, Rows
 from refref_jax.reconstruct.masks import Views
 from refref_jax.reconstruct.outlines import Outlines, fit_profile
+from refref_jax.reconstruct.relief import Relief
 from refref_jax.reconstruct.revolution import Axis, Profile
 from refref_jax.reconstruct.shape_from_refraction import SingleObject
 from refref_jax.reconstruct.shapes import FixedShape, FreeSurface
@@ -188,6 +189,17 @@ def test_a_single_view_fits_a_profile(views):
     cameras = views.cameras._replace(poses=views.cameras.poses[:1])
     found = fit_profile(_upright(_round(0.96)), Views(views.masks[:1], cameras))
     assert np.all(np.isfinite(found.points)) and found.points[:, 0].max() > 0.97
+
+
+def test_no_relief_is_tried_where_a_round_body_explains_the_masks(views, monkeypatch):
+    tried = []
+    monkeypatch.setattr(outlines_module, "_best_relief", lambda body, *_: tried.append(1) or body)
+    bulge = Relief(-1.0, 0.1, 0.1 * np.cos(np.linspace(0.0, 4.0 * np.pi, 48))[None].repeat(20, 0))
+    fit_profile(_upright(_round(0.99)), views, relief=bulge)
+    assert not tried
+    oval = bodies.masks_of(lambda p: bodies.ball(p / [1.0, 0.95, 1.0]), views.cameras)
+    fit_profile(_upright(_round(0.97)), Views(oval, views.cameras), relief=bulge)
+    assert len(tried) == 1
 
 
 def _upright(points, **options):
