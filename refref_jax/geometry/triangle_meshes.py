@@ -1,4 +1,4 @@
-"""Closed triangle meshes: their shading normals, measures, sections and pieces (NumPy only).
+"""Closed triangle meshes: their shading normals, measures, sections and pieces (on the host).
 
 Neighbouring faces whose normals differ by less than the crease angle belong to one smooth patch.
 At a corner, the face normals of a patch are averaged with Max's weights, which are exact where all
@@ -16,6 +16,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from trimesh import Trimesh
+from trimesh.remesh import subdivide_to_size
+from trimesh.triangles import points_to_barycentric
 
 CREASE_ANGLE = np.radians(30.0)
 """Smallest angle between face normals, in radians, at which an edge counts as sharp."""
@@ -266,6 +269,29 @@ class Mesh(NamedTuple):
 def make_mesh(vertices: Vertices, faces: Faces, *, crease_angle: float = CREASE_ANGLE) -> Mesh:
     """Returns a mesh with averaged normals, but not across creases (radians)."""
     return Mesh(vertices, faces, corner_normals(vertices, faces, crease_angle=crease_angle))
+
+
+def with_short_edges(mesh: Mesh, longest: float) -> Mesh:
+    """Returns the same surface and shading with smaller faces: long edges are halved until none is.
+
+    Args:
+      mesh: mesh to divide.
+      longest: longest edge, world units.
+    """
+    edges = mesh.vertices[mesh.faces] - mesh.vertices[np.roll(mesh.faces, 1, axis=1)]
+    if not np.any(np.linalg.norm(edges, axis=-1) > longest):
+        return mesh
+    vertices, faces, of = subdivide_to_size(*mesh[:2], longest, max_iter=30, return_index=True)
+    corners, places = mesh.vertices[mesh.faces[of]], vertices[faces]
+    shares = points_to_barycentric(np.repeat(corners, 3, axis=0), places.reshape(-1, 3))
+    shares = np.where(np.isfinite(shares), shares, 1.0).reshape(-1, 3, 3)
+    divided = Trimesh(vertices, faces, process=False)
+    divided.merge_vertices()
+    return Mesh(
+        np.asarray(divided.vertices),
+        np.asarray(divided.faces, np.int64),
+        unit_vectors(shares @ mesh.normals[of]),
+    )
 
 
 def volume(vertices: Vertices, faces: Faces) -> float:

@@ -15,10 +15,8 @@ from typing import NamedTuple
 import numpy as np
 import scipy.sparse
 from jaxtyping import Float
-from trimesh import Trimesh
-from trimesh.remesh import subdivide_to_size
 
-from refref_jax.geometry.triangle_meshes import Mesh, diameter, make_mesh, smooth_groups
+from refref_jax.geometry.triangle_meshes import Mesh, diameter, smooth_groups, with_short_edges
 from refref_jax.optics.interface_rules import NO_PARENT, nested
 from refref_jax.optics.media import INDEX_OF_AIR
 from refref_jax.reconstruct import ReconstructionError, families, gauss_newton, photometry
@@ -62,9 +60,9 @@ _FAMILY_STEPS, _FAMILY_RAYS = 4, 20_000
 # A blur is enough if errors are at most this many times what the blur alone adds.
 _ENOUGH = 2.5
 
-# Longest edge of a mesh whose vertices are to be moved, as a share of its diameter, and how many
-# times as long edges may be before they are divided.
-_LONGEST, _LONG = 0.015, 4.0
+# Longest edge of a mesh whose vertices are to be moved, the mean distance of handles, as a share of
+# its diameter, and how many times as long edges may be before they are divided.
+_LONGEST, _LONG = 0.0227, 2.6
 
 # Lengths are stated for bodies of this diameter, world units.
 _STATED_FOR = 2.6
@@ -436,6 +434,9 @@ def fit_free_surface(
         )
         fit = task.fit(model, steps, functools.partial(_later, progress, done))
         done += len(steps.blurs)
+        most = max((each.before - each.after) / each.before for each in fit.steps)
+        if most < settings.gain and not any(settings.smoothings):
+            break  # what it begins with cannot be improved
         mesh, index = model.mesh(fit.x), model.index_of(fit.x)
     return task.judged(model.shape.name, model, fit)
 
@@ -451,11 +452,7 @@ def _with_many_vertices(mesh: Mesh) -> Mesh:
     corners = mesh.vertices[mesh.faces]
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)
     longest = _LONGEST * diameter(mesh.vertices)
-    if edges.max() <= _LONG * longest:
-        return mesh
-    found = Trimesh(*subdivide_to_size(mesh.vertices, mesh.faces, longest, max_iter=30))
-    found.merge_vertices()
-    return make_mesh(np.asarray(found.vertices), np.asarray(found.faces, np.int64))
+    return with_short_edges(mesh, longest) if edges.max() > _LONG * longest else mesh
 
 
 def first_blur(candidate: Candidate, surface: Backdrop, pixels: Photographs) -> int:

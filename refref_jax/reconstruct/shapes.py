@@ -10,17 +10,15 @@ are exact if the vertices lie on a sphere. The derivatives and the priors are ou
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array, csr_array, eye_array
 from scipy.spatial import KDTree
-from trimesh import Trimesh
-from trimesh.remesh import subdivide_to_size
 
 from refref_jax.geometry.triangle_meshes import (
-    Faces,
     Mesh,
     Vertices,
     diameter,
@@ -29,6 +27,7 @@ from refref_jax.geometry.triangle_meshes import (
     unit_vectors,
     vertex_vectors,
     volume,
+    with_short_edges,
 )
 from refref_jax.reconstruct import ReconstructionError
 
@@ -177,11 +176,8 @@ def cloud_of(mesh: Mesh) -> Cloud:
     """
     check(mesh)
     middle, size = mesh.vertices.mean(axis=0), diameter(mesh.vertices)
-    vertices, faces = (mesh.vertices - middle) / size, mesh.faces
-    corners = vertices[faces]
-    if np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max() > _LONGEST:
-        divided = Trimesh(*subdivide_to_size(vertices, faces, _LONGEST))
-        vertices, faces = np.asarray(divided.vertices), np.asarray(divided.faces, np.int64)
+    small = mesh._replace(vertices=(mesh.vertices - middle) / size)
+    vertices, faces, _ = with_short_edges(small, _LONGEST)
     vectors = vertex_vectors(vertices, faces)
     areas = np.linalg.norm(vectors, axis=-1)
     used = areas > 0.0
@@ -243,8 +239,8 @@ class FreeSurface:
     The unknowns are the displacements of the handles in world units, positive outwards. A vertex
     moves along its normal at rest by the weighted mean of its nearest handles. Handles on the other
     side of a thin wall are far: distances include the difference of the normals, times twice the
-    mean distance between handles. Shading normals are Max's, within the smooth groups of the mesh
-    at rest; their derivatives are exact.
+    mean distance between handles. At rest, shading normals are those of the mesh; they change as
+    Max's do, within its smooth groups. Their derivatives are exact.
 
     Attributes:
       name: kind of the shape.
@@ -295,10 +291,12 @@ class FreeSurface:
             + eye_array(len(self.handles)) / (scale * size) ** 2
         )
         groups = smooth_groups(mesh.vertices, mesh.faces)
-        flat = is_degenerate(mesh.vertices[mesh.faces])
-        self._corners = _Corners(mesh.faces, groups, ~flat)
-        self._fallback = np.zeros((groups.max() + 1, 3))
-        self._fallback[groups.ravel()] = mesh.normals.reshape(-1, 3)
+        kept = ~is_degenerate(mesh.vertices[mesh.faces])
+        count = int(groups.max()) + 1
+        plain = _Corners(mesh.faces, groups, kept, np.zeros((count, 3)))
+        at_rest, _ = _shading_normals(mesh.vertices, self.directions, plain)
+        given = unit_vectors(_summed(groups.ravel(), mesh.normals.reshape(-1, 3), count))
+        self._corners = plain._replace(offsets=given - at_rest)
 
     def start(self) -> Unknowns:
         """Returns no displacement."""
@@ -308,12 +306,11 @@ class FreeSurface:
         """Returns the deformed mesh."""
         shifts = self.weights @ unknowns
         vertices = self.mesh.vertices + shifts[:, None] * self.directions
-        normals, slopes = _max_normals(vertices, self.directions, self._corners)
-        lost = np.all(normals == 0.0, axis=-1, keepdims=True)
+        normals, slopes = _shading_normals(vertices, self.directions, self._corners)
         return Posed(
             vertices,
             self.mesh.faces,
-            np.where(lost, self._fallback, normals),
+            normals,
             self._corners.groups,
             csr_array(_along(self.directions) @ self.weights),
             csr_array(slopes @ self.weights),
@@ -335,11 +332,13 @@ class _Corners(NamedTuple):
       faces: corner indices.
       groups: number of the normal of each corner.
       kept: faces that are not degenerate.
+      offsets: given normals minus Max's, at rest.
     """
 
     faces: Int[np.ndarray, "faces 3"]
     groups: Int[np.ndarray, "faces 3"]
     kept: Bool[np.ndarray, " faces"]
+    offsets: Float[np.ndarray, "groups 3"]
 
 
 def _spread(vertices: Vertices, apart: float) -> Int[np.ndarray, " handles"]:
@@ -386,54 +385,61 @@ def _along(directions: Vertices) -> csr_array:
     return csr_array((directions.ravel(), columns, np.arange(3 * count + 1)))
 
 
-def _max_normals(
+def _shading_normals(
     vertices: Vertices, directions: Vertices, corners: _Corners
 ) -> tuple[Float[np.ndarray, "groups 3"], csr_array]:
-    """Returns the normals, and their derivatives `[3 groups, vertices]` by displacements.
-
-    With `m = a x b / (|a|^2 |b|^2)`, `dm = (da x b + a x db) / (|a|^2 |b|^2)
-    - 2 m (a da / |a|^2 + b db / |b|^2)`. The normal `s / |s|` of the sum s changes by
-    `(I - n n^T) ds / |s|`.
-    """
+    """Returns the normals, and their derivatives `[3 groups, vertices]` by displacements."""
     faces, groups = corners.faces[corners.kept], corners.groups[corners.kept]
-    count = int(corners.groups.max()) + 1
-    sums = np.zeros((count, 3))
+    sums = np.zeros_like(corners.offsets)
     slopes, rows, columns = [], [], []
     for corner in range(3):
-        a, b = _edges(vertices, faces, corner)
-        sums += _summed(groups[:, corner], _weighted(a, b), count)
-        for step in range(3):
-            column = faces[:, (corner + step) % 3]
-            slopes.append(_slope(a, b, directions[column], step))
-            rows.append(groups[:, corner])
-            columns.append(column)
-    length = np.linalg.norm(sums, axis=-1)
-    inverse = np.divide(1.0, length, out=np.zeros_like(length), where=length > 0.0)
-    normals = sums * inverse[:, None]
+        around = [faces[:, (corner + step) % 3] for step in range(3)]
+        moving = [directions[each] for each in around]
+        vectors, by_vertices = _max_vectors([vertices[each] for each in around], moving)
+        sums += _summed(groups[:, corner], vectors, len(sums))
+        slopes += by_vertices
+        rows += [groups[:, corner]] * 3
+        columns += around
     row = np.concatenate(rows)
-    slope = np.concatenate(slopes) * inverse[row, None]
-    slope -= np.sum(slope * normals[row], axis=-1, keepdims=True) * normals[row]
+    normals, slope = _made_unit(sums, np.concatenate(slopes), row)
+    normals, slope = _made_unit(normals + corners.offsets, slope, row)
     at = (3 * row[:, None] + np.arange(3)).ravel(), np.repeat(np.concatenate(columns), 3)
-    return normals, csr_array(coo_array((slope.ravel(), at), shape=(3 * count, len(vertices))))
+    return normals, csr_array(coo_array((slope.ravel(), at), shape=(normals.size, len(vertices))))
 
 
-def _edges(vertices: Vertices, faces: Faces, corner: int) -> tuple[AtCorners, AtCorners]:
-    first, second, third = (vertices[faces[:, (corner + step) % 3]] for step in range(3))
-    return second - first, third - first
+def _max_vectors(
+    corners: Sequence[AtCorners], directions: Sequence[AtCorners]
+) -> tuple[AtCorners, list[AtCorners]]:
+    """Returns the vectors of first corners that add up to Max's normals, and their derivatives.
 
+    With edges a and b of a corner, they are `m = a x b / (|a|^2 |b|^2)`, and
+    `dm = (da x b + a x db) / (|a|^2 |b|^2) - 2 m (a da / |a|^2 + b db / |b|^2)`.
 
-def _weighted(a: AtCorners, b: AtCorners) -> AtCorners:
-    return np.cross(a, b) / (np.sum(a**2, axis=-1) * np.sum(b**2, axis=-1))[:, None]
-
-
-def _slope(a: AtCorners, b: AtCorners, direction: AtCorners, step: int) -> AtCorners:
-    """Returns the derivative of a corner's vector as the corner or the end of an edge moves."""
+    Args:
+      corners: the three corners of each face.
+      directions: directions in which they move.
+    """
+    (p, q, r), (dp, dq, dr) = corners, directions
+    a, b = q - p, r - p
     aa, bb = np.sum(a**2, axis=-1, keepdims=True), np.sum(b**2, axis=-1, keepdims=True)
-    along_a = np.sum(a * direction, axis=-1, keepdims=True) / aa
-    along_b = np.sum(b * direction, axis=-1, keepdims=True) / bb
-    first = np.cross(direction, b) / (aa * bb) - 2.0 * along_a * _weighted(a, b)
-    second = np.cross(a, direction) / (aa * bb) - 2.0 * along_b * _weighted(a, b)
-    return (-first - second, first, second)[step]
+    m = np.cross(a, b) / (aa * bb)
+
+    def slope(turned: AtCorners, along: AtCorners) -> AtCorners:
+        return turned / (aa * bb) - 2.0 * np.sum(along, axis=-1, keepdims=True) * m
+
+    of_p = slope(np.cross(dp, a - b), -(a / aa + b / bb) * dp)
+    return m, [of_p, slope(np.cross(dq, b), a * dq / aa), slope(np.cross(a, dr), b * dr / bb)]
+
+
+def _made_unit(
+    sums: Vertices, slopes: AtCorners, row: Int[np.ndarray, " corners"]
+) -> tuple[Vertices, AtCorners]:
+    """Returns `n = s / |s|` of each row, and derivatives: `(I - n n^T) ds / |s|`; 0 stays 0."""
+    length = np.linalg.norm(sums, axis=-1, keepdims=True)
+    inverse = np.divide(1.0, length, out=np.zeros_like(length), where=length > 0.0)
+    normals = sums * inverse
+    slopes = slopes * inverse[row]
+    return normals, slopes - np.sum(slopes * normals[row], axis=-1, keepdims=True) * normals[row]
 
 
 def _summed(at: Int[np.ndarray, " corners"], values: AtCorners, count: int) -> Vertices:

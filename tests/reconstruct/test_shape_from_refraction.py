@@ -447,6 +447,29 @@ def test_a_fit_ends_after_two_steps_that_gain_little(world, glass, seen):
     assert len(gauss_newton.fit(glass, glass.start(), world, seen, settings=settings).steps) == 3
 
 
+@pytest.mark.parametrize("gain, fits", [(0.02, 2), (0.005, 1)])
+def test_a_free_surface_that_gains_nothing_on_a_family_ends(
+    world, ball, seen, judges, monkeypatch, gain, fits
+):
+    """If the steps of the first group gain less than 1 %, the second group is left out."""
+    steps = tuple(
+        gauss_newton.StepFacts(0, 0.04, (1.0 - each) * 0.04, 1.0, each > 0.0, 0.1)
+        for each in (-0.03, gain)
+    )
+    count = []
+
+    def fit(model, x, *_, **__):
+        count.append(len(x))
+        return gauss_newton.Fit(x, np.eye(len(x)), steps)
+
+    monkeypatch.setattr(gauss_newton, "fit", fit)
+    from_family = shape_from_refraction.FreeSurfaceSettings((0.0, 0.0), (10, 3), (0.3, 0.0))
+    shape_from_refraction.fit_free_surface(
+        _ball_mesh(ball), _INDEX, world, seen, judges, settings=from_family
+    )
+    assert len(count) == fits and count[0] > 500
+
+
 def _one_family(monkeypatch, shape, mesh):
     """Leaves one family and a coarse free surface, which are fitted in seconds."""
     coarse = functools.partial(FreeSurface, spacing=0.25)

@@ -4,8 +4,17 @@ import time
 
 import numpy as np
 import pytest
+import trimesh
 
-from refref_jax.geometry.triangle_meshes import Mesh, diameter, make_mesh
+from refref_jax.geometry.triangle_meshes import (
+    Mesh,
+    diameter,
+    face_normals,
+    is_watertight,
+    make_mesh,
+    unit_vectors,
+    with_short_edges,
+)
 from refref_jax.reconstruct import ReconstructionError
 from refref_jax.reconstruct.shapes import (
     FreeSurface,
@@ -129,6 +138,34 @@ def test_building_takes_little_time():
     start = time.process_time()
     FreeSurface(fine)
     assert time.process_time() - start < 4.0
+
+
+def test_given_normals_are_kept_at_rest_where_edges_are_divided():
+    """The long faces around a cylinder are divided; its shading is still that of a cone."""
+    cylinder = bodies.as_mesh(trimesh.creation.cylinder(radius=1.0, height=1.0, sections=64))
+    up = np.array([0.0, 0.0, 0.2]) * _is_side(cylinder)[..., None]
+    fine = with_short_edges(
+        cylinder._replace(normals=unit_vectors(cylinder.normals + up)), longest=0.1
+    )
+    shape = FreeSurface(fine, 0.2)
+    found = mesh_of(shape.pose(shape.start()))
+    assert np.allclose(found.normals, fine.normals, atol=1e-12)
+    cone = unit_vectors(fine.vertices[fine.faces] * [1.0, 1.0, 0.0]) + np.array([0.0, 0.0, 0.2])
+    expected = np.where(_is_side(fine)[..., None], unit_vectors(cone), fine.normals)
+    assert np.linalg.norm(found.normals - expected, axis=-1).max() < np.radians(0.2)
+    assert is_watertight(fine.faces)
+    assert len(fine.faces) > 5 * len(cylinder.faces)
+
+
+def _is_side(mesh):
+    return np.abs(face_normals(mesh.vertices[mesh.faces])[:, 2:]) < 0.5
+
+
+def test_derivatives_of_given_normals():
+    ball = bodies.icosphere(3)
+    random = np.random.default_rng(4).normal(scale=0.1, size=ball.vertices.shape)
+    rough = ball._replace(normals=unit_vectors(ball.normals + random[ball.faces]))
+    posed_surfaces.assert_derivatives(FreeSurface(rough, 0.4))
 
 
 def test_samples_of_a_coarse_box_are_within_its_faces():
