@@ -320,6 +320,7 @@ def test_a_sphere_by_name_gets_its_measured_radius_in_training(tmp_path):
     assert bounds == ("spherical", None, "", (), _ORIGIN)
 
 
+@pytest.mark.slow
 def test_a_published_sphere_is_opened_with_what_its_layout_implies(tmp_path, monkeypatch):
     scene = _scene(tmp_path, "sphere_smcvx_ball", "sphere", 6.7)
     run_command("dataset.convert", f"--scene={scene}", "--to=parquet", f"--out={tmp_path / 'hf'}")

@@ -274,6 +274,7 @@ def test_a_wrong_size_of_the_background_is_seen_in_the_images(space):
     assert shares[0] < scene_analysis.MOST_MISFITS < 0.5 * shares[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("space", ["bounded", "unbounded"])
 def test_gains_of_images_are_not_mistaken_for_something_in_front_of_the_background(space):
     views, known = _room_views(), {"space": space, "size": 6.0}

@@ -37,6 +37,7 @@ def test_the_signals_are_given_back_after_an_error():
     assert [signal.getsignal(each) for each in _SIGNALS] == before
 
 
+@pytest.mark.slow
 def test_before_its_first_step_a_training_ends_with_nothing_saved(
     ball_scene, tmp_path, monkeypatch, capfd
 ):

@@ -33,6 +33,7 @@ def _ray(height):
     return jax.tree.map(lambda x: x[0], scenes.rays([[-4.0, 0.0, height]], [1.0, 0.0, 0.0]))
 
 
+@pytest.mark.slow
 def test_samples_are_along_the_bent_path_and_know_what_is_inside():
     found = ray_samples.sample_ray(_model(), _ray(0.5))
     assert found.edges.shape == (MODEL.samples + 1,) and np.all(np.diff(found.edges) >= 0.0)

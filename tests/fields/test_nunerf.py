@@ -218,6 +218,7 @@ def test_colours_at_the_extremes_are_finite_with_their_gradients():
             assert gradients.all_finite(slopes(material, lights, normal, -up)), normal
 
 
+@pytest.mark.slow
 def test_fields_are_finite_with_their_gradients_where_the_slope_is_zero():
     """Exactly so in the middle of the initial ball, whose signed value is a distance."""
     initial = initial_field(_CONFIG)

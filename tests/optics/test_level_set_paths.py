@@ -179,6 +179,7 @@ def _expected_exit(origin, centre, radius, index, aim):
     return point + centre, towards
 
 
+@pytest.mark.slow
 def test_gradients_at_both_surfaces_are_differences_of_the_analytic_ball():
     """The second point depends on the first as the origin of its ray: once, not twice."""
     start = [

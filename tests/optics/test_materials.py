@@ -108,6 +108,7 @@ def _with_every_kind(material):
     return scenes.build(_BALL, _inner(material, index=1.33), *others)
 
 
+@pytest.mark.slow
 def test_unknown_radiance_is_left_to_the_field_and_refused_elsewhere():
     scene = _with_every_kind(Material("opaque"))
     ends = ends_of(_paths(scene, _rays(0.02)))
@@ -172,6 +173,7 @@ def test_two_sheets_equal_the_slab_that_they_stand_for():
     np.testing.assert_allclose(shares[0], shares[1], rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_dispersion_is_three_scenes_of_one_colour_each():
     indices = (1.4, 1.5, 1.7)
     glass = _BALL._replace(material=Material(dispersion=indices))
@@ -337,6 +339,7 @@ def test_metal_in_a_liquid_keeps_light_in_the_liquid(rule):
     assert path.media[: path.num_bends + 1].tolist() == [0, 1, 2, 2, 1, 0]
 
 
+@pytest.mark.slow
 def test_gradients_of_the_complex_index_and_roughness_are_finite():
     scene = scenes.build(
         _BALL._replace(material=Material(roughness=0.3)),
@@ -378,6 +381,7 @@ def test_dispersed_rays_may_start_inside_parts(rule):
     np.testing.assert_array_equal(given.throughput, _paths(scene, rays).throughput)
 
 
+@pytest.mark.slow
 def test_the_share_of_rays_that_hit_counts_rays_not_colours():
     glass = _BALL._replace(material=Material(dispersion=(1.4, 1.5, 1.6)))
     rays = _rays(0.1, 2.0, 3.0, 4.0)

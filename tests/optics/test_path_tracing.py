@@ -366,6 +366,7 @@ def test_paths_scale_with_the_scene(size):
     np.testing.assert_allclose(scaled.tau[used] / size, small.tau[used], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_in_double_precision_a_slab_is_exact():
     with jax.enable_x64(True):
         scene = jax.tree.map(

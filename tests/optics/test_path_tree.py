@@ -250,6 +250,7 @@ def test_the_block_of_a_round_changes_nothing(block):
     assert in_blocks.casts == all_at_once.casts
 
 
+@pytest.mark.slow
 def test_accelerators_cast_all_rays_at_once_into_lists_of_the_same_size(monkeypatch):
     # Of a CPU, two blocks of 16.
     monkeypatch.setattr(wavefront, "_BLOCK_ON_CPU", 16)

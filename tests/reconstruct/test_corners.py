@@ -130,6 +130,7 @@ def test_every_stage_by_its_default_gives_the_box_too():
     _assert_is_box(_refined(_box_hull(), _views(_turned_box), settings).mesh)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "bad",
     [

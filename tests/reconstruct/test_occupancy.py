@@ -143,6 +143,7 @@ def test_one_view_and_one_without_an_outline_are_taken():
         assert np.all(np.isfinite(grid.values)) and np.any(grid.values < 0.0)
 
 
+@pytest.mark.slow
 def test_the_grid_covers_the_box():
     grid = _fit(*_ball_views(), config=_BRIEF)
     high = grid.low + grid.spacing * (np.array(grid.values.shape) - 1)

@@ -112,6 +112,7 @@ def test_few_pixels_tell_nothing(body, surface, clear):
     assert find_opaque_ends(body, surface, some) == ()
 
 
+@pytest.mark.slow
 def test_glass_and_ends_are_apart_and_fill_the_body(body):
     ends = (_foot(body, 0.3), _cap(body, 0.4))
     glass = clear_part(body, ends)

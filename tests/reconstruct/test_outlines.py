@@ -176,6 +176,7 @@ def test_a_ring_is_fitted_to_its_outlines():
     assert np.abs(tube[outside] - 0.3).max() < 0.01
 
 
+@pytest.mark.slow
 def test_a_profile_far_from_all_outlines_stays_as_it_is(views):
     angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 200)
     points = 0.5 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
@@ -194,6 +195,7 @@ def test_a_single_view_fits_a_profile(views):
 def test_no_relief_is_tried_where_a_round_body_explains_the_masks(views, monkeypatch):
     tried = []
     monkeypatch.setattr(outlines_module, "_best_relief", lambda body, *_: tried.append(1) or body)
+    monkeypatch.setattr(outlines_module, "_fitted_to_pixels", lambda body, _: body)
     bulge = Relief(-1.0, 0.1, 0.1 * np.cos(np.linspace(0.0, 4.0 * np.pi, 48))[None].repeat(20, 0))
     fit_profile(_upright(_round(0.99)), views, relief=bulge)
     assert not tried

@@ -199,6 +199,7 @@ def test_other_unknowns_move_a_vessel_alike_with_and_without_offsets_of_its_reli
             np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mouth", [False, True])
 def test_a_vessel_with_more_unknowns_has_the_same_shape(relief, mouth):
     body = vessels.bottle().with_relief(Relief(-1.0, 0.05, relief.factors)).with_knots(80)
@@ -257,6 +258,7 @@ def test_the_precision_of_offsets_prefers_smooth_ones():
     assert smooth @ matrix @ smooth < 0.1 * (rough @ matrix @ rough)
 
 
+@pytest.mark.slow
 def test_the_sides_of_a_block_become_flat_in_its_outlines():
     half, cameras = 0.8, bodies.cameras_around(14, size=80, distance=4.0)
     views = Views(bodies.masks_of(bodies.box, cameras, steps=120), cameras)

@@ -350,6 +350,7 @@ def test_the_index_is_found_from_a_wrong_start(world, ball, true):
     assert told[-1] == (most, most)
 
 
+@pytest.mark.slow
 def test_a_ball_that_is_a_little_off_returns(world):
     off = Sphere(np.array([0.01, -0.006, 0.008]), 1.01)
     model = SingleObject(off, 1.48)

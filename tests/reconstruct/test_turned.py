@@ -150,6 +150,7 @@ def test_a_body_is_found_under_noise(name):
     posed_surfaces.assert_closed(shape.pose(start))
 
 
+@pytest.mark.slow
 def test_what_is_round_is_none():
     ball = bodies.icosphere(4, radius=1.3)
     vase = revolved.revolve(revolved.even(revolved.vase(), 160), azimuths=96)

@@ -44,10 +44,8 @@ def _model(case):
     return Model(config, settings, scenes.build(scenes.ball()), Params((), levels, tints))
 
 
-@pytest.mark.parametrize(
-    "case",
-    [pytest.param(case, marks=() if case == _TINTED else pytest.mark.slow) for case in _CASES],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("case", _CASES)
 def test_images_show_what_complete_light_paths_see(case):
     model, rays = _model(case), image_rays(CAMERAS, 1)
     seen = render_image(model, rays)

@@ -108,6 +108,7 @@ def _straight(config, params, path=None):
     return _seen(plain, params._replace(field=params.field.field), path)
 
 
+@pytest.mark.slow
 @_each_kind_and_space
 def test_without_offsets_a_ray_is_straight(kind, space):
     config = _config(kind, space)
@@ -262,6 +263,7 @@ def _slopes_of_colours(params, config, path):
     return jnp.sum(_seen(config, params, path).composite.rgb)
 
 
+@pytest.mark.slow
 @_cases(_OFTEN[1:])
 def test_colours_train_the_deformation(kind, space):
     config = _config(kind, space)

@@ -102,6 +102,7 @@ def test_opaque_surfaces_in_front_of_an_environment_have_finite_distances(plant)
     assert np.all(np.isposinf([free.median, free.mean])) and np.all(np.isfinite(free.rgb))
 
 
+@pytest.mark.slow
 def test_only_the_field_in_front_of_the_backdrop_has_gradients():
     paths = jax.tree.map(lambda x: jnp.asarray(x)[None], _bent())
     params = jax.jit(lambda: init_params(jax.random.key(0), _INSIDE))()

@@ -417,6 +417,7 @@ def test_straight_rays_are_refined_as_their_background(scene):
     np.testing.assert_allclose(seen.linear, cameras.box_filter(fine.linear, 12), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_tile_whose_paths_do_not_fit_is_rendered_in_halves(scene, rays):
     scarce = dataclasses.replace(TREE, live_per_ray=1.0, segments_per_ray=6.0, paths_per_ray=2.0)
     met = np.isfinite(images.find_first_surface(scene.surfaces, rays).distances)
@@ -456,6 +457,7 @@ def test_a_camera_inside_an_object_has_its_interior_list():
     np.testing.assert_allclose(seen.linear, expected + 2.0, atol=0.05)
 
 
+@pytest.mark.slow
 def test_light_that_a_refined_pixel_loses_is_told(scene):
     short = dataclasses.replace(TREE, max_bends=2, truncated_paths="black")
     seen = render_known_camera(

@@ -141,6 +141,7 @@ def _distances(monkeypatch, config, path, *, fog=0.0):
     return np.array([seen.median[0], seen.mean[0]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("samples", [pytest.param(2, marks=pytest.mark.slow), 5])
 @pytest.mark.parametrize(("space", "order"), [("bounded", np.inf), ("spherical", 2)])
 def test_a_wall_is_as_far_as_the_end_of_the_path(monkeypatch, space, order, samples):

@@ -80,6 +80,7 @@ def test_one_ray_a_pixel_is_the_picture_itself(model):
         np.testing.assert_allclose(ours, expected, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_bands_of_rows_make_the_same_picture(model):
     # 16 x 16 pixels of 4 rays: bands of 3 rows of pixels, of which the last holds one.
     banded = render_camera(model, CAMERAS, 0, rays_per_pixel=4, chunk=_CHUNK, band=200)

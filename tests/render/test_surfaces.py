@@ -80,6 +80,7 @@ def test_the_distance_of_an_untrained_field_is_that_of_its_ball():
         np.testing.assert_allclose(found.accumulation, 1.0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_ray_beside_the_ball_ends_on_the_wall():
     found = _seen(_CONFIG, _params(_CONFIG, 1000.0), _straight((2.5, 2.5, -5.0)))
     assert found.surface.share < 1e-6 and found.composite.median > 10.0

@@ -211,6 +211,7 @@ def test_harmonics_above_the_degree_are_left_out():
         np.testing.assert_allclose(seen[degree], expected, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_records_of_no_gaussians_are_empty():
     none = splats.blank(0)
     found = splats.project_all(none, made_splats.AHEAD, width=16, height=16, kernel="mip")

@@ -222,6 +222,7 @@ def test_steps_lower_the_loss_and_neither_periods_nor_a_stop_change_them(monkeyp
     assert not np.array_equal(other.means, _last(setup, begun, 5)[0].gaussians.means)
 
 
+@pytest.mark.slow
 def test_a_capacity_that_is_too_small_is_found_and_the_steps_repeated(monkeypatch):
     setup, begun = _setup(), _begun()
     whole, _ = _last(setup, begun, 10)

@@ -137,6 +137,7 @@ def _after_a_round(run):
     return lambda: len(run_folder.read_metrics(run)) == _ROUND
 
 
+@pytest.mark.slow
 def test_a_paused_run_continues_to_the_same_bits(scene, run, tmp_path):
     stop = _after_a_round(tmp_path / "run")
     fit(_config(scene), out=tmp_path / "run", stop=stop, report=lambda line: None)
@@ -191,6 +192,7 @@ def test_gains_of_rounds_are_expected_to_fall_geometrically(rounds, expected):
     assert backdrop_fit._expected_gain(rounds) == pytest.approx(expected)
 
 
+@pytest.mark.slow
 def test_gains_of_the_images_are_learned_resumed_and_written(scene, tmp_path):
     config = _config(scene).override(exposure="per_image")
     lines, stop = [], _after_a_round(tmp_path / "run")

@@ -111,6 +111,7 @@ def ball() -> Scene:
     return scenes.build(scenes.ball(1.3, subdivisions=2))
 
 
+@pytest.mark.slow
 def test_an_environment_is_recovered_through_glass(ball):
     views, sky = _views(), _environment()
     blocks = _equations(ball, views, _photographs(ball, sky, views, _TREE), settings=_TREE)
@@ -125,6 +126,7 @@ def test_an_environment_is_recovered_through_glass(ball):
     assert np.sqrt(np.mean((seen - block.srgb) ** 2)) < 0.012
 
 
+@pytest.mark.slow
 def test_paused_solving_is_the_same_as_solving_without_a_pause(ball):
     views = _views(4, 16)
     blocks = _equations(ball, views, _photographs(ball, _environment(), views, STRAIGHT))

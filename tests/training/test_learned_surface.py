@@ -201,6 +201,7 @@ def test_meshes_are_needed_to_begin_from_them():
     assert {"surface_index": 1.5} in found.values()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("index", [1.01, 1.5, 3.0])
 def test_a_learned_index_returns_from_its_bounds(index):
     config = fit.prepare(

@@ -131,6 +131,7 @@ def test_steps_taken_at_once_are_the_same_steps(every):
         _assert_identical(found, one_by_one[step])
 
 
+@pytest.mark.slow
 def test_a_run_resumed_within_a_pool_may_take_other_strides(tmp_path):
     whole, _ = _train(_setup(), _start(), 11)
     for state, _ in loop.run_steps(_setup(), _start(), 6, every=(4,)):

@@ -85,6 +85,7 @@ def _kill(folder, scenes, *, victim, after):
     return process.wait(_LONG)
 
 
+@pytest.mark.slow
 @_NEEDS_PROC
 def test_killed_while_it_trains_it_goes_on_and_its_command_ends_with_it(tmp_path, serve, scenes):
     _kill(tmp_path, scenes, victim="benchmark", after=0)
@@ -177,6 +178,7 @@ def test_scenes_and_methods_are_added_and_settings_stay(tmp_path, serve, scenes)
     assert _text(tmp_path, "benchmark.json") == before
 
 
+@pytest.mark.slow
 def test_results_of_two_machines_are_merged_by_copying(tmp_path, serve, scenes):
     here, there = tmp_path / "here", tmp_path / "there"
     here.mkdir()

@@ -80,6 +80,7 @@ def test_poses_come_back(views, photos, surface, traced, monkeypatch):
     assert "5, of which 5 are explained better" in found.describe()
 
 
+@pytest.mark.slow
 def test_views_that_nothing_explains_stay_as_they_are(views, photos, surface, traced, monkeypatch):
     monkeypatch.setattr(through_object, "_PIXELS", 200)
     noise = np.random.default_rng(0).integers(256, size=(_SIZE, _SIZE, 3), dtype=np.uint8)
@@ -93,6 +94,7 @@ def test_views_that_nothing_explains_stay_as_they_are(views, photos, surface, tr
     assert np.abs(found.corrections[1]).max() < 5e-3
 
 
+@pytest.mark.slow
 def test_judges_are_other_pixels_and_a_camera_may_be_in_the_middle(
     photos, views, surface, traced, monkeypatch
 ):

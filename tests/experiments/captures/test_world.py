@@ -144,6 +144,7 @@ def test_a_ball_is_found_in_its_masks_whatever_its_place_and_size(scale):
     assert sees(found, cameras).all()
 
 
+@pytest.mark.slow
 def test_empty_masks_and_a_wrong_one_do_no_harm():
     cameras = orbit(40, distance=4.0, elevation=0.5, size=64, angle_x=1.0)
     masks = _masks_of_a_ball(cameras, np.zeros(3), 0.5)

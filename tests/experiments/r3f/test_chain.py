@@ -513,6 +513,7 @@ def test_before_a_field_there_is_no_refinement_by_light(scene, whole, tmp_path, 
     shutil.copytree(whole, out)
     monkeypatch.setattr(index_stage, "learn_backdrop", lambda *_, **options: None)
     monkeypatch.setattr(light_stage, "fit", None)  # would raise
+    monkeypatch.setattr(geometry_stage, "shape_from_outlines", lambda *_, **options: None)
     found = _run(scene, out, _LIT, compare=False)
     assert found.light == records.LightFacts(
         False, 1.5, remark="the background is a field, not a surface at a known place"

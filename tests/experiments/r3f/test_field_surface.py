@@ -113,6 +113,7 @@ def test_masks_that_are_there_are_kept(scene, untrained, tmp_path, geometry):
     assert field_surface.warnings(scene, tmp_path) == ()
 
 
+@pytest.mark.slow
 def test_a_reconstruction_without_masks_says_so(bare, untrained, tmp_path, monkeypatch):
     monkeypatch.setattr(report, "_HEIGHT", 40)
     out = tmp_path / "out"

@@ -50,6 +50,7 @@ def test_a_model_offers_what_it_has(model):
     assert layers.offered(straight, truth=False) == ("rgb", "distance")
 
 
+@pytest.mark.slow
 def test_the_two_branches_sum_to_the_picture(model):
     both, through, mirrored = (
         render_image(model, _RAYS, branch=branch).linear
