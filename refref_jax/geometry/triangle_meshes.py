@@ -16,7 +16,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from trimesh import Trimesh
 from trimesh.remesh import subdivide_to_size
 from trimesh.triangles import points_to_barycentric
 
@@ -274,6 +273,8 @@ def make_mesh(vertices: Vertices, faces: Faces, *, crease_angle: float = CREASE_
 def with_short_edges(mesh: Mesh, longest: float) -> Mesh:
     """Returns the same surface and shading with smaller faces: long edges are halved until none is.
 
+    An edge is halved for both of its faces. Parts of a degenerate face have its mean normal.
+
     Args:
       mesh: mesh to divide.
       longest: longest edge, world units.
@@ -282,16 +283,13 @@ def with_short_edges(mesh: Mesh, longest: float) -> Mesh:
     if not np.any(np.linalg.norm(edges, axis=-1) > longest):
         return mesh
     vertices, faces, of = subdivide_to_size(*mesh[:2], longest, max_iter=30, return_index=True)
-    corners, places = mesh.vertices[mesh.faces[of]], vertices[faces]
-    shares = points_to_barycentric(np.repeat(corners, 3, axis=0), places.reshape(-1, 3))
-    shares = np.where(np.isfinite(shares), shares, 1.0).reshape(-1, 3, 3)
-    divided = Trimesh(vertices, faces, process=False)
-    divided.merge_vertices()
-    return Mesh(
-        np.asarray(divided.vertices),
-        np.asarray(divided.faces, np.int64),
-        unit_vectors(shares @ mesh.normals[of]),
-    )
+    corners = mesh.vertices[mesh.faces[of]]
+    shares = np.full((len(faces), 3, 3), 1.0 / 3.0)
+    whole = ~is_degenerate(corners)
+    shares[whole] = points_to_barycentric(
+        np.repeat(corners[whole], 3, axis=0), vertices[faces[whole]].reshape(-1, 3)
+    ).reshape(-1, 3, 3)
+    return Mesh(vertices, faces.astype(np.int64), unit_vectors(shares @ mesh.normals[of]))
 
 
 def volume(vertices: Vertices, faces: Faces) -> float:

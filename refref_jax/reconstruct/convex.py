@@ -1,4 +1,4 @@
-"""Restores convex meshes, whose edges a grid has cut off, on the host.
+"""Restores convex meshes, whose edges a grid has cut off (NumPy only).
 
 Masks constrain a convex object better than any other, because its surface is the envelope of its
 tangent planes. `from_tangents` intersects these planes, which restores the edges that a grid cuts
@@ -11,13 +11,11 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
+from scipy.spatial import ConvexHull, HalfspaceIntersection, KDTree, QhullError
 
-from refref_jax.compilation import at_once
 from refref_jax.geometry.triangle_meshes import (
     CREASE_ANGLE,
     Mesh,
-    Vertices,
     diameter,
     face_normals,
     face_vectors,
@@ -55,8 +53,8 @@ _SAME = 1e-6
 # Faces that meet at a smaller angle belong to the same facet, radians.
 _COPLANAR = np.radians(3.0)
 
-# Largest number of distances of vertices from planes that are computed at once.
-_AT_ONCE = 1 << 21
+# Faces of a hull that bound the depth of a vertex.
+_NEAREST = 8
 
 # Share of the volume by which a convex mesh may differ from its hull, because of rounding.
 _ROUNDING = 1e-6
@@ -121,16 +119,22 @@ def is_convex(mesh: Mesh) -> bool:
 def depth_below_hull(mesh: Mesh) -> float:
     """Returns how far the deepest vertex lies below the convex hull, in world units.
 
-    From inside a convex body, the nearest plane of its faces is as near as its surface.
+    From inside a convex body, the nearest plane of its faces is as near as its surface. The planes
+    of the nearest faces bound the depth of each vertex; those of largest bounds are measured first,
+    until no other can be deeper.
     """
-    planes = np.unique(ConvexHull(mesh.vertices).equations, axis=0)
-    count = max(1, _AT_ONCE // len(planes))
-    some = [mesh.vertices[i : i + count] for i in range(0, len(mesh.vertices), count)]
-
-    def depth(points: Vertices) -> float:
-        return float((-planes[:, 3] - points @ planes[:, :3].T).min(axis=1).max())
-
-    return max(at_once(depth, some))
+    vertices, outer = mesh.vertices, ConvexHull(mesh.vertices)
+    middles = vertices[outer.simplices].mean(axis=1)
+    nearest = KDTree(middles).query(vertices, k=range(1, 1 + min(_NEAREST, len(middles))))[1]
+    near = outer.equations[nearest]
+    bounds = (-near[..., 3] - np.sum(near[..., :3] * vertices[:, None], axis=-1)).min(axis=1)
+    normals, offsets = outer.equations[:, :3], outer.equations[:, 3]
+    deepest = -math.inf
+    for vertex in np.argsort(-bounds):
+        if bounds[vertex] <= deepest:
+            break
+        deepest = max(deepest, float((-offsets - normals @ vertices[vertex]).min()))
+    return deepest
 
 
 def from_tangents(mesh: Mesh, *, crease_angle: float = CREASE) -> Mesh:

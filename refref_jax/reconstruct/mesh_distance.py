@@ -62,7 +62,7 @@ _GROWTH = 4
 _MOST = 128
 
 # Largest number of points times triangles processed at once.
-_SWEEP = 1 << 20
+_SWEEP = 1 << 19
 
 # A triangle is subdivided if an edge is longer than this share of the diameter.
 _LONGEST_EDGE = 0.04

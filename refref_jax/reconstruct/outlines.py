@@ -205,8 +205,8 @@ def fit_profile(
 ) -> Revolution:
     """Fits a body of revolution to outlines alone.
 
-    It gets a relief, and then narrow ridges such as rings and threads, only if some pixels of masks
-    are not explained without them, and if they are explained better.
+    It gets a relief, and then narrow ridges such as rings and threads, only if the body without
+    them leaves pixels of masks unexplained, and if the masks are then explained better.
 
     Args:
       outer: a body near the outlines, such as that of a mesh from masks.

@@ -60,9 +60,9 @@ _FAMILY_STEPS, _FAMILY_RAYS = 4, 20_000
 # A blur is enough if errors are at most this many times what the blur alone adds.
 _ENOUGH = 2.5
 
-# Longest edge of a mesh whose vertices are to be moved, the mean distance of handles, as a share of
-# its diameter, and how many times as long edges may be before they are divided.
-_LONGEST, _LONG = 0.0227, 2.6
+# Longest edge of a mesh whose vertices are to be moved, which is the mean distance of handles, as a
+# share of its diameter; and how many times as long edges may be before they are divided.
+_LONGEST, _LONG = 1.0 / 44.0, 2.6
 
 # Lengths are stated for bodies of this diameter, world units.
 _STATED_FOR = 2.6
@@ -78,7 +78,8 @@ class FreeSurfaceSettings:
       counts: number of steps of each group, without blur.
       widest: scale of the robust weights in the first step of each group, sRGB: wide ones find
         faults that few pixels see; narrow ones, at the end, are more precise.
-      gain: gain of two steps below which a group ends.
+      gain: gain of two steps in a row below which a group ends. Where no group is smoothed, a group
+        without a step of this gain is the last one.
     """
 
     smoothings: tuple[float, ...] = (0.05, 0.02, 0.02, 0.0)
@@ -420,7 +421,7 @@ def fit_free_surface(
       progress: function called with the number of steps, and what the last one did.
     """
     task = _Task(surface, pixels, judges, outlines, deviation, seed)
-    mesh, done = _with_many_vertices(mesh), 0
+    mesh, done, smoothed = _with_many_vertices(mesh), 0, max(settings.smoothings)
     groups = zip(settings.smoothings, settings.counts, settings.widest, strict=True)
     for number, (smoothing, count, widest) in enumerate(groups):
         if smoothing and not _has_creases(mesh):
@@ -434,8 +435,8 @@ def fit_free_surface(
         )
         fit = task.fit(model, steps, functools.partial(_later, progress, done))
         done += len(steps.blurs)
-        most = max((each.before - each.after) / each.before for each in fit.steps)
-        if most < settings.gain and not any(settings.smoothings):
+        least = 1.0 - settings.gain
+        if smoothed == 0.0 and all(each.after > least * each.before for each in fit.steps):
             break  # what it begins with cannot be improved
         mesh, index = model.mesh(fit.x), model.index_of(fit.x)
     return task.judged(model.shape.name, model, fit)

@@ -1,4 +1,4 @@
-"""Closed surfaces that depend on unknowns, and the free surface among them (NumPy only).
+"""Closed surfaces that depend on unknowns, and the free surface among them, on the host.
 
 A shape turns a vector of unknowns into a mesh of fixed connectivity and the exact derivatives of
 its vertices and normals, as a Gauss-Newton solver needs them. `families` has the shapes of few
@@ -239,8 +239,8 @@ class FreeSurface:
     The unknowns are the displacements of the handles in world units, positive outwards. A vertex
     moves along its normal at rest by the weighted mean of its nearest handles. Handles on the other
     side of a thin wall are far: distances include the difference of the normals, times twice the
-    mean distance between handles. At rest, shading normals are those of the mesh; they change as
-    Max's do, within its smooth groups. Their derivatives are exact.
+    mean distance between handles. At rest, shading normals are the means of those of the mesh
+    within its smooth groups; they change as Max's do. Their derivatives are exact.
 
     Attributes:
       name: kind of the shape.
@@ -292,11 +292,11 @@ class FreeSurface:
         )
         groups = smooth_groups(mesh.vertices, mesh.faces)
         kept = ~is_degenerate(mesh.vertices[mesh.faces])
-        count = int(groups.max()) + 1
-        plain = _Corners(mesh.faces, groups, kept, np.zeros((count, 3)))
+        plain = _Corners(mesh.faces, groups, kept, np.zeros((int(groups.max()) + 1, 3)))
         at_rest, _ = _shading_normals(mesh.vertices, self.directions, plain)
-        given = unit_vectors(_summed(groups.ravel(), mesh.normals.reshape(-1, 3), count))
-        self._corners = plain._replace(offsets=given - at_rest)
+        given = unit_vectors(_summed(groups.ravel(), mesh.normals.reshape(-1, 3), len(at_rest)))
+        known = np.any(given != 0.0, axis=-1, keepdims=True)
+        self._corners = plain._replace(offsets=np.where(known, given - at_rest, 0.0))
 
     def start(self) -> Unknowns:
         """Returns no displacement."""
@@ -410,7 +410,7 @@ def _shading_normals(
 def _max_vectors(
     corners: Sequence[AtCorners], directions: Sequence[AtCorners]
 ) -> tuple[AtCorners, list[AtCorners]]:
-    """Returns the vectors of first corners that add up to Max's normals, and their derivatives.
+    """Returns each face's share of Max's normal at its first corner, and its derivatives.
 
     With edges a and b of a corner, they are `m = a x b / (|a|^2 |b|^2)`, and
     `dm = (da x b + a x db) / (|a|^2 |b|^2) - 2 m (a da / |a|^2 + b db / |b|^2)`.

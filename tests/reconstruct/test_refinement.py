@@ -128,6 +128,22 @@ def test_depths_below_a_hull_are_distances_from_it():
     assert found == pytest.approx(expected, abs=1e-12) and found > 0.05
 
 
+def test_few_vertices_of_a_convex_mesh_are_compared_with_all_planes(monkeypatch):
+    """All of them, on 40,000 vertices, would take a minute."""
+    ball = bodies.icosphere(6)
+    measured = []
+    find = np.argsort
+
+    def counted(bounds):
+        for vertex in find(bounds):
+            measured.append(vertex)
+            yield vertex
+
+    monkeypatch.setattr(convex.np, "argsort", counted)
+    assert convex.depth_below_hull(ball) < 1e-12
+    assert len(ball.vertices) == 40_962 and len(measured) < 2000
+
+
 def test_floaters_go_and_the_largest_piece_stays_whatever_the_share():
     body, speck = bodies.icosphere(3), bodies.icosphere(1, radius=0.1, centre=(3.0, 0.0, 0.0))
     both = bodies.joined(speck, body)

@@ -350,7 +350,6 @@ def test_the_index_is_found_from_a_wrong_start(world, ball, true):
     assert told[-1] == (most, most)
 
 
-@pytest.mark.slow
 def test_a_ball_that_is_a_little_off_returns(world):
     off = Sphere(np.array([0.01, -0.006, 0.008]), 1.01)
     model = SingleObject(off, 1.48)
@@ -469,6 +468,19 @@ def test_a_free_surface_that_gains_nothing_on_a_family_ends(
         _ball_mesh(ball), _INDEX, world, seen, judges, settings=from_family
     )
     assert len(count) == fits and count[0] > 500
+
+
+def test_a_free_surface_that_explains_all_of_a_black_world_ends(ball, seen, judges, monkeypatch):
+    monkeypatch.setattr(
+        shape_from_refraction, "FreeSurface", functools.partial(FreeSurface, spacing=0.5)
+    )
+    black = _world(pyramid=backdrop.init(_SIDE, radiance=0.0))
+    dark, others = (each._replace(rgb=np.zeros_like(each.rgb)) for each in (seen, judges))
+    settings = shape_from_refraction.FreeSurfaceSettings((0.0,), (2,), (0.0,))
+    trial = shape_from_refraction.fit_free_surface(
+        _ball_mesh(ball), _INDEX, black, dark, others, settings=settings
+    )
+    assert trial.error == 0.0
 
 
 def _one_family(monkeypatch, shape, mesh):

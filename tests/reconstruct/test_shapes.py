@@ -10,9 +10,11 @@ from refref_jax.geometry.triangle_meshes import (
     Mesh,
     diameter,
     face_normals,
+    is_degenerate,
     is_watertight,
     make_mesh,
     unit_vectors,
+    volume,
     with_short_edges,
 )
 from refref_jax.reconstruct import ReconstructionError
@@ -159,6 +161,26 @@ def test_given_normals_are_kept_at_rest_where_edges_are_divided():
 
 def _is_side(mesh):
     return np.abs(face_normals(mesh.vertices[mesh.faces])[:, 2:]) < 0.5
+
+
+def test_normals_that_are_not_given_are_those_of_the_mesh(ball):
+    lost = ball._replace(normals=np.where(ball.faces[..., None] == 7, 0.0, ball.normals))
+    found = mesh_of(FreeSurface(lost).pose(np.zeros(len(FreeSurface(lost).handles))))
+    np.testing.assert_allclose(found.normals, ball.normals, atol=1e-12)
+
+
+def test_dividing_edges_keeps_a_mesh_with_a_degenerate_face_closed():
+    """The face has three corners on one line, and no normal."""
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0.5, 0, 0]], float)
+    faces = np.array([[0, 2, 1], [0, 4, 3], [4, 1, 3], [0, 1, 4], [0, 3, 2], [1, 2, 3]])
+    for size in (1e-7, 1.0, 1e7):
+        mesh = make_mesh(size * vertices, faces)
+        fine = with_short_edges(mesh, 0.3 * size)
+        assert is_watertight(fine.faces) and np.all(np.isfinite(fine.normals))
+        np.testing.assert_allclose(volume(*fine[:2]), size**3 / 6.0, rtol=1e-12)
+        kept = ~is_degenerate(fine.vertices[fine.faces])
+        flat = face_normals(fine.vertices[fine.faces])[kept, None]
+        np.testing.assert_allclose(np.sum(fine.normals[kept] * flat, axis=-1), 1.0, atol=1e-9)
 
 
 def test_derivatives_of_given_normals():

@@ -207,6 +207,7 @@ def test_every_image_is_used_once_before_any_again():
     assert not np.array_equal(order, training.order_of(8, 5, range(20)))
 
 
+@pytest.mark.slow
 @pytest.mark.longest
 def test_steps_lower_the_loss_and_neither_periods_nor_a_stop_change_them(monkeypatch):
     monkeypatch.setattr(training, "_PERIOD", 10)

@@ -157,7 +157,6 @@ def scene(tmp_path, room):
     return folder
 
 
-@pytest.mark.slow
 def test_the_command_writes_a_scene_with_other_poses(scene, tmp_path, room):
     out = tmp_path / "refined"
     said = run_command("refine_cameras", f"--scene={scene}", f"--out={out}").stdout

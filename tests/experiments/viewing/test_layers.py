@@ -64,6 +64,7 @@ def test_the_two_branches_sum_to_the_picture(model):
     assert mirrored[~beside].mean() < 0.3 * through[~beside].mean()
 
 
+@pytest.mark.slow
 def test_another_index_is_another_picture_of_the_same_programs(model):
     subject = Subject("made", model, "nested", None, ("glass",), (9, 18), 4096)
     first = session.first_choice(subject)
