@@ -1,4 +1,4 @@
-"""Samples scalar fields on regular grids and extracts their level sets as meshes, on the host.
+"""Samples scalar fields on regular grids and extracts their level sets as meshes (NumPy only).
 
 A field is negative inside an object and positive outside, in world units, and changes by about 1
 per unit near the surface. The axes of a grid are x, y, z; point `(i, j, k)` lies at `low + spacing
@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import map_coordinates, maximum_filter, minimum_filter
 
-from refref_jax.compilation import at_once
 from refref_jax.geometry.triangle_meshes import CREASE_ANGLE, Faces, Mesh, Vertices, corner_normals
 from refref_jax.reconstruct import ReconstructionError
 
@@ -30,7 +29,7 @@ An exact distance needs sqrt(3) / 2; an approximate distance needs a little more
 _COARSE = 4
 
 # Points evaluated at once, which bounds the memory of a field with many terms.
-_SWEEP = 1 << 16
+_SWEEP = 1 << 18
 
 
 class Box(NamedTuple):
@@ -122,10 +121,11 @@ def gradient(grid: Grid, points: Points) -> Points:
 def _evaluate(
     field: Field, low: Float[np.ndarray, "3"], spacing: float, index: Int[np.ndarray, "points 3"]
 ) -> Values:
-    points = [
-        low + spacing * index[start : start + _SWEEP] for start in range(0, len(index), _SWEEP)
+    parts = [
+        field(low + spacing * index[start : start + _SWEEP])
+        for start in range(0, len(index), _SWEEP)
     ]
-    return np.concatenate([np.zeros(0), *at_once(field, points)])
+    return np.concatenate([np.zeros(0), *parts])
 
 
 def _index(grid: Grid, points: Points) -> Float[np.ndarray, "3 points"]:
