@@ -271,7 +271,7 @@ def make_mesh(vertices: Vertices, faces: Faces, *, crease_angle: float = CREASE_
 
 
 def with_short_edges(mesh: Mesh, longest: float) -> Mesh:
-    """Returns the same surface and shading with smaller faces: long edges are halved until none is.
+    """Returns the same surface and shading, with long edges halved until none is too long.
 
     An edge is halved for both of its faces. Parts of a degenerate face have its mean normal.
 

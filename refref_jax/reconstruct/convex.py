@@ -53,7 +53,7 @@ _SAME = 1e-6
 # Faces that meet at a smaller angle belong to the same facet, radians.
 _COPLANAR = np.radians(3.0)
 
-# Faces of a hull that bound the depth of a vertex.
+# Number of near faces of a hull that give an upper bound of the depth of a vertex.
 _NEAREST = 8
 
 # Share of the volume by which a convex mesh may differ from its hull, because of rounding.
@@ -119,9 +119,9 @@ def is_convex(mesh: Mesh) -> bool:
 def depth_below_hull(mesh: Mesh) -> float:
     """Returns how far the deepest vertex lies below the convex hull, in world units.
 
-    From inside a convex body, the nearest plane of its faces is as near as its surface. The planes
-    of the nearest faces bound the depth of each vertex; those of largest bounds are measured first,
-    until no other can be deeper.
+    Inside a convex body, the distance to its surface is that to the nearest plane of its faces. The
+    planes of a few near faces give an upper bound for each vertex. Vertices are measured against
+    all planes in the order of these bounds, until no other can be deeper.
     """
     vertices, outer = mesh.vertices, ConvexHull(mesh.vertices)
     middles = vertices[outer.simplices].mean(axis=1)

@@ -451,7 +451,7 @@ def test_a_fit_ends_after_two_steps_that_gain_little(world, glass, seen):
 def test_a_free_surface_that_gains_nothing_on_a_family_ends(
     world, ball, seen, judges, monkeypatch, gain, fits
 ):
-    """If the steps of the first group gain less than 1 %, the second group is left out."""
+    """If no step of the first group gains 1 %, the second group is left out."""
     steps = tuple(
         gauss_newton.StepFacts(0, 0.04, (1.0 - each) * 0.04, 1.0, each > 0.0, 0.1)
         for each in (-0.03, gain)
