@@ -8,7 +8,7 @@ import pytest
 from refref_jax.geometry.triangle_meshes import make_mesh, volume
 from refref_jax.reconstruct import ReconstructionError, free_vessels, gauss_newton, photometry
 from refref_jax.reconstruct.contents import Interior
-from refref_jax.reconstruct.free_vessels import FreeVessel, distances_inside
+from refref_jax.reconstruct.free_vessels import FreeVessel, distances_inside, inner_wall
 from refref_jax.reconstruct.mesh_distance import signed_distance
 from tests.factories import bodies, vessels
 from tests.laws import posed_surfaces
@@ -30,9 +30,13 @@ def inside(mesh):
         return distances_inside(mesh)
 
 
+def vessel_with(mesh, interior, inside):
+    return FreeVessel(mesh, inner_wall(mesh, interior, inside), interior)
+
+
 @pytest.fixture(scope="module")
 def vessel(mesh, inside):
-    return FreeVessel(mesh, Interior("air", wall=0.12, base=0.3, stained=True), inside)
+    return vessel_with(mesh, Interior("air", wall=0.12, base=0.3, stained=True), inside)
 
 
 def test_the_inner_wall_is_at_its_distance_and_above_its_base(mesh, vessel):
@@ -70,6 +74,22 @@ def test_the_inner_wall_follows_the_outer_one(vessel):
     np.testing.assert_allclose(np.linalg.norm(thinner, axis=-1), 0.03, atol=1e-9)
 
 
+def test_a_finer_vessel_is_the_same_with_more_handles(vessel):
+    x = vessel.start() + 0.001 * np.random.default_rng(0).normal(size=vessel.layout.count)
+    finer = vessel.finer(x)
+    for one, other in zip(vessel.solids(x), finer.solids(finer.start()), strict=True):
+        np.testing.assert_array_equal(other.mesh.vertices, one.mesh.vertices)
+        np.testing.assert_allclose(other.mesh.normals, one.mesh.normals, atol=1e-9)
+        assert other.index == one.index
+        np.testing.assert_allclose(other.tint, one.tint, rtol=1e-12)
+    few, many = (
+        [each.stop - each.start for each in (v.layout.outer, v.layout.inner)]
+        for v in (vessel, finer)
+    )
+    assert many[0] > few[0]
+    assert many[1] > 2 * few[1]
+
+
 def test_walls_that_cross_are_noticed(vessel):
     x = vessel.start()
     assert not vessel.surfaces_cross(x)
@@ -88,7 +108,7 @@ def test_walls_that_cross_are_noticed(vessel):
 )
 def test_what_it_cannot_be_is_refused(mesh, inside, interior, message):
     with pytest.raises(ReconstructionError, match=message):
-        FreeVessel(mesh, interior, inside)
+        vessel_with(mesh, interior, inside)
 
 
 @pytest.mark.slow
@@ -96,8 +116,8 @@ def test_light_finds_thickness_and_tint(mesh, inside, monkeypatch):
     monkeypatch.setattr(photometry, "_TILE", 1024)
     surface, tint = vessels.smooth_backdrop(), (0.9, 0.97, 0.85)
     truth = Interior("air", wall=0.12, glass=1.5, stained=True, glass_tint=tint)
-    seen = vessels.photographs(FreeVessel(mesh, truth, inside), surface, reach=0.7)
-    start = FreeVessel(mesh, Interior("air", wall=0.16, stained=True), inside)
+    seen = vessels.photographs(vessel_with(mesh, truth, inside), surface, reach=0.7)
+    start = vessel_with(mesh, Interior("air", wall=0.16, stained=True), inside)
     steps = gauss_newton.Steps((1, 1, *[0] * 6), 4096, 4096)
     fit = gauss_newton.fit(start, start.start(), surface, seen, settings=steps)
     found = start.interior(fit.x)
@@ -115,12 +135,13 @@ def test_a_vessel_that_is_far_worse_than_another_shape_gets_no_further_steps(
 ):
     monkeypatch.setattr(photometry, "_TILE", 1024)
     small = {"_WALLS": (0.05,), "_BASES": (0.0,), "_FIRST": (1,), "_OTHERS": (0,)}
-    small |= {"_FIRST_RAYS": 2000, "_RAYS": 2000, "_JUDGES": 2000}
+    small |= {"_FINEST": (0,), "_FIRST_RAYS": 2000, "_RAYS": 2000, "_FINEST_RAYS": 2000}
+    small |= {"_JUDGES": 2000}
     for name, value in small.items():
         monkeypatch.setattr(free_vessels, name, value)
     monkeypatch.setattr(free_vessels, "distances_inside", lambda mesh: inside)
     surface = vessels.smooth_backdrop()
-    truth = FreeVessel(mesh, Interior("air", wall=0.12, stained=True), inside)
+    truth = vessel_with(mesh, Interior("air", wall=0.12, stained=True), inside)
     seen = vessels.photographs(truth, surface, reach=0.7)
     told = []
     fit = functools.partial(
@@ -128,5 +149,5 @@ def test_a_vessel_that_is_far_worse_than_another_shape_gets_no_further_steps(
     )
     given_up, steps = fit(rival=1e-6), len(told)
     followed = fit()
-    assert len(told) - steps == steps + 1
+    assert len(told) - steps == steps + 2
     assert followed.error < given_up.error
