@@ -58,10 +58,21 @@ def _few_mappings():
         jax.clear_caches()
 
 
+def _dtype_promotion(request):
+    loose = request.node.get_closest_marker("loose")
+    return jax.numpy_dtype_promotion("standard" if loose else "strict")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _strict_fixtures(request):
+    """What fixtures of a module have traced under another setting, its tests would trace again."""
+    with _dtype_promotion(request):
+        yield
+
+
 @pytest.fixture(autouse=True)
 def _strict_dtypes(request):
-    loose = request.node.get_closest_marker("loose")
-    with jax.numpy_dtype_promotion("standard" if loose else "strict"):
+    with _dtype_promotion(request):
         yield
 
 

@@ -20,7 +20,7 @@ def gaussians(count, *, seed=1, sizes=(0.02, 0.25)):
         draw.normal(size=(count, 3)),
         0.2 * draw.normal(size=(count, 15, 3)),
     )
-    return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), values)
+    return jax.device_put(jax.tree.map(np.float32, values))
 
 
 def view(*, seed=1, distance=2.0):
@@ -28,7 +28,7 @@ def view(*, seed=1, distance=2.0):
     turn = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
     turn *= np.sign(np.linalg.det(turn))
     position = -turn.T @ np.array([0.0, 0.0, distance])
-    return View(*(jnp.asarray(x, jnp.float32) for x in (turn, position, FOCAL)))
+    return jax.device_put(View(*map(np.float32, (turn, position, FOCAL))))
 
 
 def one(mean, *, scale=0.1, opacity=0.8, colour=(1.0, 0.0, 0.0), quaternion=(1, 0, 0, 0)):
@@ -39,12 +39,12 @@ def one(mean, *, scale=0.1, opacity=0.8, colour=(1.0, 0.0, 0.0), quaternion=(1, 
         logit = np.log(opacity) - np.log1p(-opacity)
     constant = (np.array(colour) - 0.5) / 0.28209479177387814
     values = (mean, quaternion, scales, logit, constant, np.zeros((15, 3)))
-    return Gaussians(*(jnp.asarray(x, jnp.float32)[None] for x in values))
+    return jax.device_put(Gaussians(*(np.float32(x)[None] for x in values)))
 
 
 def joined(*parts):
     """Returns all Gaussians of several lists."""
-    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+    return jax.device_put(jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts))
 
 
 AHEAD = View(jnp.eye(3), jnp.zeros(3), jnp.float32(20.0))

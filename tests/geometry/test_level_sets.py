@@ -10,8 +10,6 @@ from refref_jax.geometry.surfaces import closest, meet, slope
 from tests.factories import level_sets
 from tests.laws import gradients
 
-pytestmark = pytest.mark.computing
-
 _CENTRE, _RADIUS = np.array([0.1, 0.2, -0.1]), 1.2
 _TORUS = np.array([1.1, 0.4])
 
@@ -26,6 +24,9 @@ def _hit(surface, origin, direction):
     nothing = jnp.int32(NO_PRIMITIVE)
     found = closest(surface, origin, direction, jnp.full_like(origin[0], jnp.inf), nothing)
     return found, meet(surface, found, origin, direction)
+
+
+_compiled_hit, _compiled_closest = jax.jit(_hit), jax.jit(closest)
 
 
 def _rays(count, seed=0, distance=4.0):
@@ -137,11 +138,11 @@ def test_normals_have_gradients_too():
 def test_a_ray_from_the_surface_meets_its_other_side():
     surface, up = level_sets.ball(_CENTRE, _RADIUS), jnp.array([0.0, 0.0, 1.0])
     top = jnp.asarray(_CENTRE) + _RADIUS * up
-    found, point = _hit(surface, top, -up)
+    found, point = _compiled_hit(surface, top, -up)
     assert found != NO_PRIMITIVE
     np.testing.assert_allclose(point.position, _CENTRE - _RADIUS * np.array(up), atol=1e-11)
-    assert _hit(surface, top, up)[0] == NO_PRIMITIVE
-    limited = closest(surface, top, -up, jnp.float64(1.0), jnp.int32(NO_PRIMITIVE))
+    assert _compiled_hit(surface, top, up)[0] == NO_PRIMITIVE
+    limited = _compiled_closest(surface, top, -up, jnp.float64(1.0), jnp.int32(NO_PRIMITIVE))
     assert limited == NO_PRIMITIVE
 
 
@@ -153,7 +154,7 @@ def test_a_normal_that_faces_the_wrong_way_is_mirrored():
 
     coarse = level_sets.level_set(values)._replace(step=jnp.float64(0.5))
     direction = jnp.array([0.6, 0.0, -0.8])
-    point = _hit(coarse, -direction, direction)[1]
+    point = _compiled_hit(coarse, -direction, direction)[1]
     np.testing.assert_allclose(point.position, 0.0, atol=1e-9)
     assert jnp.dot(slope(coarse, point.position), direction) > 0.0
     assert jnp.dot(point.shading_normal, direction) < 0.0

@@ -21,7 +21,7 @@ from tests.factories import level_sets, scenes
 from tests.laws import gradients
 from tests.oracles import reference
 
-pytestmark = [pytest.mark.computing, pytest.mark.longest]
+pytestmark = pytest.mark.longest
 
 _TWO = PathSettings(max_bends=2, reflections="first")
 _ORIGIN = np.zeros(3)

@@ -5,6 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from refref_jax.data.mesh_queries import find_containment
+from refref_jax.data.scene_assembly import assemble_scene
 from refref_jax.optics import path_tracing
 from refref_jax.optics.light_paths import PathStatus, straight
 from refref_jax.optics.media import AMBIENT
@@ -51,12 +53,19 @@ def _refracted(scene, rays, bends=10):
 
 
 @functools.cache
-def _ball_in_ball(rule, inner_index=1.333):
-    return scenes.build(
+def _concentric(inner_index):
+    """Returns two balls, and which of them lies in the other: that takes longer than the rest."""
+    parts = (
         scenes.ball(1.0, index=1.5, subdivisions=5, name="outer_glass"),
         scenes.ball(0.6, index=inner_index, subdivisions=5, name="inner"),
-        rule=rule,
     )
+    return parts, find_containment(parts)
+
+
+@functools.cache
+def _ball_in_ball(rule, inner_index=1.333):
+    parts, tree = _concentric(inner_index)
+    return jax.device_put(assemble_scene(parts, tree.parents, rule=rule, overlaps=tree.overlaps))
 
 
 def _check_against_spheres(scene, spheres, heights, bends):
@@ -331,9 +340,9 @@ def test_an_empty_scene_bends_nothing(settings):
 
 def test_no_rays_have_no_paths():
     rays = jax.tree.map(lambda x: x[:0], _many_rays())
-    traced = path_tracing.trace(scenes.build(scenes.ball(1.0)), rays, settings=TREE, capacity=8)
+    traced = _trace(scenes.build(scenes.ball(1.0)), rays, settings=TREE, capacity=8)
     assert traced.paths.statuses.shape == (0,)
-    assert path_tracing.trace_ends(scenes.build(), rays, settings=TREE).casts == 0
+    assert scenes.trace_ends(scenes.build(), rays, settings=TREE).casts == 0
 
 
 def test_a_camera_inside_glass_starts_in_its_medium():

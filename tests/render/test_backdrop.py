@@ -24,6 +24,9 @@ def _rays(count, *, radius=1e-2, seed=0):
     return Rays(*(jnp.asarray(x, jnp.float32) for x in (0.3 * drawn[0], directions, radii)))
 
 
+_straight = jax.jit(functools.partial(straight_ends, footprint="differential"))
+
+
 @functools.partial(jax.jit, static_argnames=("domain", "most_taps", "axes"))
 def _lookups(domain, rays, *, most_taps=3, axes=0):
     ends = straight_ends(rays, footprint="differential")
@@ -52,7 +55,7 @@ def _random_pyramid(seed=1):
 
 
 def test_faint_paths_have_one_tap():
-    ends = straight_ends(_rays(200, radius=0.1), footprint="differential")
+    ends = _straight(_rays(200, radius=0.1))
     dimmed = ends._replace(throughput=jnp.full((200, 3), 0.05))
 
     @jax.jit
@@ -124,15 +127,15 @@ def test_a_uniform_surface_is_the_throughput_of_each_pixel(space):
 
 @pytest.mark.parametrize("space", _SPACES)
 def test_native_loops_are_the_formulas_of_other_devices(space):
-    lookups = _lookups(_DOMAINS[space], _rays(300, radius=0.1))
+    lookups = _lookups(_DOMAINS[space], _rays(200, radius=0.1))
     mips = _mipmap(_random_pyramid(), space)
     table = backdrop._table(mips)
     np.testing.assert_allclose(
-        _run(backdrop._read_native, 150, table, lookups),
-        _run(backdrop._read, 150, table, lookups),
+        _run(backdrop._read_native, 100, table, lookups),
+        _run(backdrop._read, 100, table, lookups),
         rtol=1e-5,
     )
-    slopes = jnp.asarray(np.random.default_rng(2).normal(size=(150, 3)), jnp.float32)
+    slopes = jnp.asarray(np.random.default_rng(2).normal(size=(100, 3)), jnp.float32)
     np.testing.assert_allclose(
         _run(backdrop._add_native, len(table), slopes, lookups),
         _run(backdrop._add, len(table), slopes, lookups),
@@ -142,10 +145,10 @@ def test_native_loops_are_the_formulas_of_other_devices(space):
 
 @pytest.mark.parametrize("space", _SPACES)
 def test_the_transpose_of_the_colours(space):
-    lookups = _lookups(_DOMAINS[space], _rays(300, radius=0.1))
+    lookups = _lookups(_DOMAINS[space], _rays(200, radius=0.1))
     mips = tuple(_random_pyramid()[::-1])
-    slopes = jnp.asarray(np.random.default_rng(2).normal(size=(150, 3)), jnp.float32)
-    forward = np.vdot(_colours(mips, lookups, pixels=150), slopes)
+    slopes = jnp.asarray(np.random.default_rng(2).normal(size=(100, 3)), jnp.float32)
+    forward = np.vdot(_colours(mips, lookups, pixels=100), slopes)
     back = _transposed(slopes, lookups, resolution=_SIDE)
     backward = sum(np.vdot(a, b) for a, b in zip(mips, back, strict=True))
     np.testing.assert_allclose(forward, backward, rtol=1e-4)
@@ -204,14 +207,14 @@ def test_there_are_no_seams(space):
 
 @pytest.mark.parametrize("space", _SPACES)
 def test_axes_are_the_change_of_the_place_across_a_pixel(space):
-    domain, rays = _DOMAINS[space], _rays(100, radius=1e-3)
+    domain, rays = _DOMAINS[space], _rays(200, radius=1e-3)
     lookups = _lookups(domain, rays)
-    ends = straight_ends(rays, footprint="differential")
+    ends = _straight(rays)
     for axis in range(2):
         moved = rays._replace(directions=rays.directions + ends.differentials.directions[:, axis])
         there = _lookups(domain, moved)
         same = _faces(there) == _faces(lookups)
-        assert same.sum() > 90 and np.all(lookups.sides == _SIDE)
+        assert same.sum() > 180 and np.all(lookups.sides == _SIDE)
         change = np.sqrt(3.0) * (_middles(there) - _middles(lookups))
         across = np.asarray(lookups.steps) * np.asarray(lookups.taps)[..., None]
         np.testing.assert_allclose(change[same], across[same][:, axis], rtol=0.03, atol=2e-3)
@@ -244,7 +247,10 @@ def test_a_coarse_level_is_interpolated_exactly_on_finer_grids():
     np.testing.assert_allclose(finest, expected, atol=1e-6)
 
 
-@pytest.mark.parametrize("space", _SPACES)
+@pytest.mark.parametrize(
+    "space",
+    ["bounded", *(pytest.param(each, marks=pytest.mark.slow) for each in _SPACES[1:])],
+)
 def test_gradients_by_radiance_and_throughput_are_finite_differences(space):
     lookups, pyramid = _lookups(_DOMAINS[space], _rays(40, radius=0.1)), _random_pyramid()
     target = jnp.asarray(np.random.default_rng(5).uniform(size=(20, 3)), jnp.float32)

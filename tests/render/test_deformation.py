@@ -160,13 +160,17 @@ def test_a_turned_sample_is_seen_from_elsewhere():
 def test_moved_samples_stay_in_the_unit_cube(space):
     config = _config("raydef", space)
     domain = config.domain
-    gaussians = polylines.Gaussians(jnp.full((6, 1, 3), 0.4), jnp.full((6, 1), 0.01))
-    line = polylines.whole_path(_path())
-    points = jax.vmap(polylines.point_at, in_axes=(None, 0))(line, jnp.arange(6.0))
+
+    @jax.jit
+    def move(params):
+        gaussians = polylines.Gaussians(jnp.full((6, 1, 3), 0.4), jnp.full((6, 1), 0.01))
+        line = polylines.whole_path(_path())
+        points = jax.vmap(polylines.point_at, in_axes=(None, 0))(line, jnp.arange(6.0))
+        moved = learned_media.move(params, config.field, domain, gaussians, points, _ONE)
+        return *moved, points
+
     params = _with_offset(_trained(config), position=(9.0, -9.0, 0.5))
-    moved, turned, bent = learned_media.move(
-        params.field, config.field, domain, gaussians, points, _ONE
-    )
+    moved, turned, bent, points = move(params.field)
     radii = 4.0 if space == "unbounded" else 2.0
     expected = np.tile([1.0, 0.0, 0.4 + 0.5 / radii], (6, 1))
     np.testing.assert_allclose(moved.positions[:, 0], expected, atol=1e-6)
@@ -177,27 +181,37 @@ def test_moved_samples_stay_in_the_unit_cube(space):
 # --- polylines ---
 
 
+@functools.partial(jax.jit, static_argnums=0)
+def _knots(config, path, s):
+    warp = volume_rendering.distance_warp(config, polylines.whole_path(path))
+    return scene_bounds.to_distance(warp, s)
+
+
 def _bend(config, wanted, monkeypatch, path=None):
     """Bends a ray by given offsets of its knots, in world units.
 
     Returns:
       The distances and places of the knots along the straight ray, the polyline, and the bent ray.
     """
-    line = polylines.whole_path(_path() if path is None else path)
-    warp = volume_rendering.distance_warp(config, line)
-    s = np.arange(1, len(wanted) + 1, dtype=np.float32) / len(wanted)
-    t = np.asarray(scene_bounds.to_distance(warp, jnp.asarray(s)))
-    places = np.asarray(line.points[0]) + t[:, None] * np.asarray(line.directions[0])
-    table = jnp.asarray(np.asarray(wanted) / config.radius, jnp.float32)
-    cells = 0.5 * jnp.asarray(places / config.radius, jnp.float32) + 0.5
+    path = _path() if path is None else path
+    t = np.asarray(_knots(config, path, np.linspace(0.0, 1.0, len(wanted) + 1)[1:]))
+    places = np.asarray(path.points[0]) + t[:, None] * np.asarray(path.directions[0])
+    table = np.float32(np.asarray(wanted) / config.radius)
+    cells = np.float32(0.5 * places / config.radius + 0.5)
 
     def planted(params, field, cell, direction, progress):
         nearest = jnp.argmin(jnp.sum(jnp.square(cells - cell[None]), axis=-1))
-        return Offset(table[nearest], jnp.zeros(3))
+        return Offset(jnp.asarray(table)[nearest], jnp.zeros(3))
 
     monkeypatch.setattr(registry, "deform", planted)
-    bent, losses = learned_media.bend(None, config.field, config.domain, line, warp, _ONE)
-    return t, places, bent, losses
+
+    @jax.jit
+    def bend(path):
+        line = polylines.whole_path(path)
+        warp = volume_rendering.distance_warp(config, line)
+        return learned_media.bend(None, config.field, config.domain, line, warp, _ONE)
+
+    return t, places, *bend(path)
 
 
 @pytest.mark.slow

@@ -8,9 +8,9 @@ import pytest
 from refref_jax.geometry.cameras import image_rays
 from refref_jax.optics.light_paths import PathStatus
 from refref_jax.optics.path_settings import PAPER, STRAIGHT, TREE, everything
-from refref_jax.render import Model, images, init_params, render_image, render_rays
+from refref_jax.render import Model, images, render_image, render_rays
 from tests.factories import scenes
-from tests.factories.small_model import CAMERAS, MODEL
+from tests.factories.small_model import CAMERAS, MODEL, initial
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -23,8 +23,7 @@ def tile():
 
 @pytest.fixture(scope="module")
 def model():
-    params = init_params(jax.random.key(0), MODEL)
-    return Model(MODEL, PAPER, scenes.build(scenes.ball(1.3, subdivisions=2)), params)
+    return Model(MODEL, PAPER, scenes.build(scenes.ball(1.3, subdivisions=2)), initial(MODEL))
 
 
 @pytest.fixture(scope="module")

@@ -2,16 +2,15 @@
 
 import dataclasses
 
-import jax
 import numpy as np
 import pytest
 
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics.light_paths import PathStatus
 from refref_jax.optics.path_settings import STRAIGHT, TREE
-from refref_jax.render import Model, init_params, pixel_paths
+from refref_jax.render import Model, pixel_paths
 from refref_jax.render.pixel_paths import PixelPaths
-from tests.factories.small_model import MODEL
+from tests.factories.small_model import MODEL, initial
 
 _SETTINGS = dataclasses.replace(TREE, max_bends=6, min_throughput=1e-3)
 
@@ -77,8 +76,7 @@ def test_a_ray_that_meets_nothing_is_one_straight_line(slab):
 
 
 def test_in_a_bounded_scene_last_segments_end_at_its_walls(slab):
-    params = init_params(jax.random.key(0), MODEL)
-    model = Model(MODEL, STRAIGHT, slab, params)
+    model = Model(MODEL, STRAIGHT, slab, initial(MODEL))
     paths = pixel_paths.trace_pixel(model, _ray((0.5, 0.0, 4.0), (0.0, 0.0, -1.0)))
     np.testing.assert_allclose(paths.polylines[0], [[0.5, 0, 4], [0.5, 0, -7.5]], atol=1e-5)
     assert paths.statuses == (PathStatus.NOT_TRACED,)

@@ -1,23 +1,22 @@
 """Several rays in a pixel: what is averaged, and how."""
 
-import jax
 import numpy as np
 import pytest
 
 from refref_jax import choices
 from refref_jax.geometry import cameras
 from refref_jax.optics.path_settings import STRAIGHT
-from refref_jax.render import Model, Rendering, images, init_params, render_camera, render_image
+from refref_jax.render import Model, Rendering, images, render_camera, render_image
 from tests.factories import scenes
-from tests.factories.small_model import CAMERAS, MODEL
+from tests.factories.small_model import CAMERAS, MODEL, initial
 
 _CHUNK = 512
 
 
 @pytest.fixture(scope="module")
 def model():
-    params = init_params(jax.random.key(0), MODEL)
-    return Model(MODEL, STRAIGHT, scenes.build(scenes.ball(1.3, subdivisions=1)), params)
+    scene = scenes.build(scenes.ball(1.3, subdivisions=1))
+    return Model(MODEL, STRAIGHT, scene, initial(MODEL))
 
 
 @pytest.mark.parametrize(("rays", "side"), [(1, 1), (4, 2), (9, 3), (16, 4), (49, 7)])

@@ -74,9 +74,14 @@ def test_lists_are_those_of_gsplat(recorded):
     values, view = _as_recorded(recorded, np.float32)
     found = _projected(values, view)._replace(radii=jnp.float32(recorded["radii"]))
     grid = Grid(*recorded["size"].tolist(), int(recorded["tile"]))
-    lists = images.make_lists(found, grid, capacity=2000)
+
+    @jax.jit
+    def listed(found):
+        return images.make_lists(found, grid, capacity=2000), images.count_entries(found, grid)
+
+    lists, count = listed(found)
     total = int(lists.total)
-    assert total == recorded["counts"].sum() == int(images.count_entries(found, grid))
+    assert total == recorded["counts"].sum() == int(count)
     np.testing.assert_array_equal(lists.offsets[:-1], recorded["offsets"])
     np.testing.assert_array_equal(lists.entries[:total], recorded["owners"])
 
@@ -94,9 +99,9 @@ def test_colours_are_those_of_gsplat(recorded):
         value = value._replace(colours=coefficient[0], harmonics=coefficient[1:])
         return splats.colour(value, direction, 3)
 
-    found = jax.vmap(one)(jnp.float32(directions), jnp.float32(coefficients))
+    found = jax.jit(jax.vmap(one))(jnp.float32(directions), jnp.float32(coefficients))
     np.testing.assert_allclose(found, np.maximum(recorded["colours"] + 0.5, 0.0), atol=2e-6)
-    basis = spherical_harmonics(jnp.float32([0.36, 0.48, 0.8]))
+    basis = jax.jit(spherical_harmonics)(jnp.float32([0.36, 0.48, 0.8]))
     assert float(basis[1] * signs[1]) == pytest.approx(-0.234529, abs=1e-6)
 
 
@@ -204,8 +209,10 @@ def test_harmonics_above_the_degree_are_left_out():
     value = jax.tree.map(lambda x: x[0], made_splats.gaussians(1))
     value = value._replace(harmonics=jnp.abs(value.harmonics) + 0.1, colours=jnp.full(3, 5.0))
     direction = jnp.float32([0.6, 0.48, 0.64])
-    seen = [np.asarray(splats.colour(value, direction, jnp.float32(d))) for d in range(4)]
-    basis = np.asarray(spherical_harmonics(direction))[1:, None] * np.asarray(value.harmonics)
+    colour = jax.jit(splats.colour)
+    seen = [np.asarray(colour(value, direction, jnp.float32(d))) for d in range(4)]
+    basis = np.asarray(jax.jit(spherical_harmonics)(direction))[1:, None]
+    basis = basis * np.asarray(value.harmonics)
     for degree, count in enumerate((0, 3, 8, 15)):
         expected = 0.5 + 5.0 * splats.CONSTANT + basis[:count].sum(axis=0)
         np.testing.assert_allclose(seen[degree], expected, rtol=1e-5)

@@ -287,13 +287,18 @@ def test_more_entries_than_an_integer_holds_are_no_small_number(gaussians, side,
 
 def test_both_lists_are_equal():
     found = _PROJECT(made_splats.gaussians(300), made_splats.view())
-    boxes = images._boxes(found.means, found.radii, _GRID)
-    order = jnp.argsort(found.depths, stable=True).astype(jnp.int32)
-    boxes = jax.tree.map(lambda x: x[order], boxes)
-    both = [
-        make(order, boxes, grid=_GRID, capacity=_CAPACITY)
-        for make in (images._filled_lists, images._sorted_lists)
-    ]
+
+    @jax.jit
+    def listed(found):
+        boxes = images._boxes(found.means, found.radii, _GRID)
+        order = jnp.argsort(found.depths, stable=True).astype(jnp.int32)
+        boxes = jax.tree.map(lambda x: x[order], boxes)
+        return [
+            make(order, boxes, grid=_GRID, capacity=_CAPACITY)
+            for make in (images._filled_lists, images._sorted_lists)
+        ]
+
+    both = listed(found)
     total = int(both[0].total)
     assert total == int(both[1].total) > 1000
     np.testing.assert_array_equal(both[0].offsets, both[1].offsets)

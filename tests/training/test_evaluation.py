@@ -8,11 +8,11 @@ from experiments.runs import perceptual
 from refref_jax import metrics
 from refref_jax.data.scene_folder import Frames
 from refref_jax.optics.path_settings import STRAIGHT, TREE
-from refref_jax.render import Model, Rendering, init_params
+from refref_jax.render import Model, Rendering
 from refref_jax.training import evaluation
 from refref_jax.training.evaluation import Perceptual
 from tests.factories import made_lpips, scenes
-from tests.factories.small_model import CAMERAS, MODEL
+from tests.factories.small_model import CAMERAS, MODEL, initial
 
 pytestmark = pytest.mark.loose
 
@@ -196,8 +196,8 @@ def test_without_a_mask_all_pixels_are_beside_the_object():
 
 
 def _model(settings):
-    params = init_params(jax.random.key(0), MODEL)
-    return Model(MODEL, settings, scenes.build(scenes.ball(1.3, subdivisions=1)), params)
+    scene = scenes.build(scenes.ball(1.3, subdivisions=1))
+    return Model(MODEL, settings, scene, initial(MODEL))
 
 
 def test_evaluating_is_rendering_and_measuring_view_by_view(ball_scene):

@@ -15,10 +15,10 @@ from refref_jax.data.scene_folder import read_frames
 from refref_jax.geometry.cameras import image_rays
 from refref_jax.optics.interface_rules import RULES
 from refref_jax.optics.path_settings import PAPER, STRAIGHT
-from refref_jax.render import Model, images, init_params, render_image
+from refref_jax.render import Model, images, render_image
 from refref_jax.render import pixels as rendering
 from tests.factories import scenes
-from tests.factories.small_model import CAMERAS, MODEL
+from tests.factories.small_model import CAMERAS, MODEL, initial
 
 _RAYS = image_rays(CAMERAS, 0)
 _OPTIONS = {"chunk": 4096, "most": 256, "cancelled": lambda: False}
@@ -28,8 +28,8 @@ _OPTIONS = {"chunk": 4096, "most": 256, "cancelled": lambda: False}
 def model():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(images, "TILE", 256)
-        params = init_params(jax.random.key(0), MODEL)
-        yield Model(MODEL, PAPER, scenes.build(scenes.ball(1.3, subdivisions=2)), params)
+        scene = scenes.build(scenes.ball(1.3, subdivisions=2))
+        yield Model(MODEL, PAPER, scene, initial(MODEL))
 
 
 def _blank():
