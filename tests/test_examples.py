@@ -41,7 +41,15 @@ def _examples(name, value):
 _TESTS = [test for name, value in (_MODULES | _NAMED).items() for test in _examples(name, value)]
 
 
-@pytest.mark.parametrize("test", _TESTS, ids=lambda test: test.name)
+# Each compiles a tracer of its own, and its function is tested by every run of the suite.
+_SLOW = {"refref_jax.follow_main_branches", "refref_jax.render.shade", "refref_jax.trace"}
+
+
+@pytest.mark.parametrize(
+    "test",
+    [pytest.param(x, marks=pytest.mark.slow if x.name in _SLOW else ()) for x in _TESTS],
+    ids=lambda test: test.name,
+)
 def test_an_example_prints_what_it_says(test, capsys):
     results = doctest.DocTestRunner().run(test, clear_globs=False)
     assert results.attempted > 0

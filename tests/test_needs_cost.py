@@ -179,10 +179,7 @@ def _traced_operations(material):
 
 @pytest.mark.parametrize(
     "name",
-    [
-        pytest.param(name, marks=() if name in ("opaque", "rough") else pytest.mark.slow)
-        for name in _MATERIALS
-    ],
+    [pytest.param(name, marks=() if name == "opaque" else pytest.mark.slow) for name in _MATERIALS],
 )
 def test_each_material_costs_operations_only_where_a_part_has_it(name):
     material, needed = _MATERIALS[name]

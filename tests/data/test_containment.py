@@ -125,7 +125,12 @@ _TURNS = (lambda part: part, inverted, _moved, _shuffled)
 # Every order, and every turn by turns.
 @pytest.mark.parametrize(
     ("order", "turn"),
-    list(zip(itertools.permutations(range(3)), itertools.cycle(_TURNS), strict=False)),
+    [
+        pytest.param(order, turn, marks=() if number < len(_TURNS) else pytest.mark.slow)
+        for number, (order, turn) in enumerate(
+            zip(itertools.permutations(range(3)), itertools.cycle(_TURNS), strict=False)
+        )
+    ],
 )
 def test_each_of_three_nested_parts_lies_in_the_next(order, turn):
     parts = [ball(radius=0.5, centre=(0.2, 0.0, 0.0)), box(size=(2.0, 2.0, 2.0)), ball(radius=3.0)]
@@ -157,7 +162,10 @@ def test_balls_that_cut_each_other(shift):
     assert _pairs(found) == {frozenset({0, 1})}
 
 
-@pytest.mark.parametrize("part", [box(), ball(), _moved(box()), _moved(ball())])
+@pytest.mark.parametrize(
+    "part",
+    [box(), pytest.param(ball(), marks=pytest.mark.slow), _moved(box()), _moved(ball())],
+)
 def test_coincident_parts_overlap_and_do_not_contain_each_other(part):
     found = find_containment([part, part._replace(name="twin_water")])
     assert found.parents == (NO_PARENT, NO_PARENT)

@@ -1,10 +1,9 @@
-import shutil
-
 import numpy as np
 import pytest
 
 from refref_jax.data import image_files, scene_folder
 from refref_jax.geometry.cameras import image_rays, planar_depth_to_distance
+from tests.factories.cut_ball import cut_ball
 from tests.factories.small_scenes import (
     HEIGHT,
     WIDTH,
@@ -378,9 +377,8 @@ def test_two_frames_of_one_name(scene, other):
 
 @pytest.mark.parametrize("split", scene_folder.SPLITS)
 @pytest.mark.parametrize("kind", ["", "mask", "depth"])
-def test_checking_a_scene_finds_a_broken_file_in_any_split(tmp_path, ball_scene, split, kind):
-    scene = tmp_path / "scene"
-    shutil.copytree(ball_scene, scene)
+def test_checking_a_scene_finds_a_broken_file_in_any_split(tmp_path, split, kind):
+    scene = cut_ball(tmp_path / "scene")
     scene_folder.check_scene(scene)
     broken = sorted((scene / kind / split).glob("*.png"))[-1]
     broken.write_bytes(broken.read_bytes()[:-30])
@@ -389,9 +387,8 @@ def test_checking_a_scene_finds_a_broken_file_in_any_split(tmp_path, ball_scene,
         scene_folder.check_scene(scene)
 
 
-def test_checking_a_scene_does_without_val_and_test(tmp_path, ball_scene):
-    scene = tmp_path / "scene"
-    shutil.copytree(ball_scene, scene)
+def test_checking_a_scene_does_without_val_and_test(tmp_path):
+    scene = cut_ball(tmp_path / "scene")
     for split in ("val", "test"):
         (scene / f"transforms_{split}.json").unlink()
     scene_folder.check_scene(scene)

@@ -214,7 +214,9 @@ def test_good_priorities_have_no_findings():
     assert _priorities(_ranked(2, "a"), _ranked(1, "b", centre=(1.0, 0.0, 0.0))) == []
 
 
-@pytest.mark.parametrize("priority", [1, 0, -1])
+@pytest.mark.parametrize(
+    "priority", [1, *(pytest.param(number, marks=pytest.mark.slow) for number in (0, -1))]
+)
 def test_a_part_that_would_vanish(priority):
     drink = _ranked(priority, "drink_water", radius=0.5)
     finding = only(_priorities(_ranked(1, "cup_glass"), drink))
@@ -301,7 +303,7 @@ def test_a_pane_between_two_liquids_is_no_gap():
 # Cutting.
 
 
-@pytest.mark.parametrize("shift", [0.3, 1.0])
+@pytest.mark.parametrize("shift", [0.3, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_parts_that_cut_each_other_are_warned_about(shift):
     parts = (ball("a_glass"), ball("b_water", centre=(shift, 0.0, 0.0)))
     finding = only(_findings(*parts))
@@ -310,7 +312,9 @@ def test_parts_that_cut_each_other_are_warned_about(shift):
     assert "use the rule 'priority'" in finding.message
 
 
-@pytest.mark.parametrize("part", [ball("b_water"), box("b_water")])
+@pytest.mark.parametrize(
+    "part", [pytest.param(ball("b_water"), marks=pytest.mark.slow), box("b_water")]
+)
 def test_coincident_parts_are_warned_about(part):
     finding = only(_findings(part._replace(name="a_glass"), part))
     assert finding.severity == "warning"
@@ -329,7 +333,7 @@ def test_a_drink_that_fills_its_cup():
     assert _share(finding.message) == pytest.approx((side + end) / (side + 2 * end), abs=0.02)
 
 
-@pytest.mark.parametrize("closer", [1e-6, 3e-5])
+@pytest.mark.parametrize("closer", [pytest.param(1e-6, marks=pytest.mark.slow), 3e-5])
 def test_walls_too_close_to_be_told_apart_coincide(closer):
     parts = [ball("a_glass"), ball("b_water", radius=1.0 - closer, index=1.333)]
     assert "coincides" in only(_warnings(*parts)).message

@@ -44,6 +44,14 @@ _CONFIGS |= {
 }
 
 
+def _few(*names):
+    """Every run of the suite tests these, and slow ones the others."""
+    marks = {name: () if name in names else pytest.mark.slow for name in _CONFIGS}
+    return pytest.mark.parametrize(
+        "name", [pytest.param(name, marks=mark) for name, mark in marks.items()]
+    )
+
+
 @jax.jit
 def _untrained(seed):
     return zipnerf.init_radiance(jax.random.key(seed), _RADIANCE)
@@ -251,7 +259,7 @@ def test_gradients_reach_every_layer_and_table(name):
 
 
 @pytest.mark.parametrize("transformation", transformations.ALL)
-@pytest.mark.parametrize("name", _CONFIGS)
+@_few("density", "radiance", "nerfacto radiance with a skip")
 def test_transformations_change_nothing(name, transformation):
     gaussians = jax.tree.map(lambda *x: jnp.stack(x), *(_gaussians(seed=seed) for seed in range(3)))
     directions = jnp.stack([_direction(seed) for seed in range(3)])
@@ -282,13 +290,7 @@ def _taught(name, precision, params, gaussians):
     return jax.tree.leaves(seen), slopes
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=() if name in ("density", "radiance") else pytest.mark.slow)
-        for name in _CONFIGS
-    ],
-)
+@_few("density", "radiance")
 def test_half_precision_is_near_single_precision(name):
     single, single_slopes = _taught(name, "float32", _parameters(name), _gaussians())
     half, half_slopes = _taught(name, "bfloat16", _parameters(name), _gaussians())
@@ -301,7 +303,7 @@ def test_half_precision_is_near_single_precision(name):
     assert any((np.asarray(a) != np.asarray(b)).any() for a, b in zip(half, single, strict=True))
 
 
-@pytest.mark.parametrize("name", _CONFIGS)
+@_few("density", "radiance", "nerfacto radiance with a skip")
 @pytest.mark.parametrize("size", [0.0, 1e4])
 @pytest.mark.parametrize("scale", [0.0, 1e30])
 def test_half_precision_is_finite(name, size, scale):

@@ -21,6 +21,9 @@ _SHAPE = {"density_width": 8, "bottleneck": 4, "colour_width": 8, "colour_depth"
 _CONFIG = RosenerfConfig(_GRID, **_SHAPE, ray_width=6, ray_depth=2)
 _ONE = jnp.float32(1.0)
 
+_radiance = jax.jit(rosenerf.radiance, static_argnums=1)
+_deform = jax.jit(jax.vmap(registry.deform, in_axes=(None, None, 0, None, None)), static_argnums=1)
+
 
 def _direction():
     return arrays.single([0.48, -0.6, 0.64])
@@ -39,9 +42,7 @@ def _points(origin, count=9):
 
 
 def _moved(params, places, progress=_ONE):
-    offsets = jax.vmap(registry.deform, in_axes=(None, None, 0, None, None))(
-        params, _CONFIG, places, _direction(), progress
-    )
+    offsets = _deform(params, _CONFIG, places, _direction(), progress)
     return jax.tree.map(lambda x: np.asarray(x, np.float64), offsets)
 
 
@@ -70,7 +71,7 @@ def test_offsets_by_plain_matrix_products():
     place, ray = np.array([0.61, 0.4, 0.72]), np.asarray(_direction(), np.float64)
     centred = 2.0 * place - 1.0
     along = centred @ ray
-    harmonics = np.asarray(hash_grid.spherical_harmonics(_direction()))
+    harmonics = np.asarray(jax.jit(hash_grid.spherical_harmonics)(_direction()))
     hidden = np.concatenate([centred - along * ray, harmonics])
     for i in range(2):
         layer = layers[f"Dense_{i}"]
@@ -102,20 +103,20 @@ def test_features_of_both_rays_are_added_by_plain_matrix_products():
     layers = jax.tree.map(lambda x: np.asarray(x, np.float64), params.field["params"])
     both = _one([0.3, 0.7, 0.55]), _one([0.6, 0.2, 0.4])
     table = {"params": params.field["params"]["MultisampledGrid_0"]}
-    grid = hash_grid.MultisampledGrid(_GRID, _CONFIG.precision)
+    look_up = jax.jit(hash_grid.MultisampledGrid(_GRID, _CONFIG.precision).apply)
     hidden = np.zeros(8)
     for ray in both:
-        features = np.asarray(grid.apply(table, ray), np.float64)
+        features = np.asarray(look_up(table, ray), np.float64)
         first = layers["Dense_0"]
         hidden += np.maximum(features @ first["kernel"] + first["bias"], 0.0)
     hidden = np.maximum(hidden @ layers["Dense_1"]["kernel"] + layers["Dense_1"]["bias"], 0.0)
     raw = hidden @ layers["Dense_2"]["kernel"] + layers["Dense_2"]["bias"]
-    found = rosenerf.radiance(params, _CONFIG, _pair(*both), _direction())
+    found = _radiance(params, _CONFIG, _pair(*both), _direction())
     expected = zipnerf.activate_density(jnp.float32(raw[0]))
     np.testing.assert_allclose(found.density, expected, rtol=1e-4)
-    swapped = rosenerf.radiance(params, _CONFIG, _pair(*both[::-1]), _direction())
+    swapped = _radiance(params, _CONFIG, _pair(*both[::-1]), _direction())
     np.testing.assert_allclose(found.rgb, swapped.rgb, rtol=1e-5)
-    alone = rosenerf.radiance(params, _CONFIG, _pair(both[0], both[0]), _direction())
+    alone = _radiance(params, _CONFIG, _pair(both[0], both[0]), _direction())
     assert np.max(np.abs(found.rgb - alone.rgb)) > 1e-4
 
 
@@ -123,12 +124,16 @@ def test_features_of_both_rays_are_added_by_plain_matrix_products():
 def test_samples_are_those_of_both_rays_seen_from_the_first(space):
     params, count = _trained(), 5
     places, _ = _points([0.1, 0.2, -0.15], count)
-    gaussians = Gaussians(places[:, None].repeat(2, 1), jnp.full((count, 2), 0.01))
-    towards = jnp.tile(_direction(), (count, 1))
-    none = jnp.zeros(count)
-    points = PolylinePoint(places, towards, none, none < 1.0, jnp.zeros((count, 2, 3)))
-    domain = Domain(2.0, space)
-    moved, seen, bent = learned_media.move(params, _CONFIG, domain, gaussians, points, _ONE)
+    towards, domain = np.tile(np.asarray(_direction()), (count, 1)), Domain(2.0, space)
+
+    @jax.jit
+    def move(params, places, towards):
+        gaussians = Gaussians(places[:, None].repeat(2, 1), jnp.full((count, 2), 0.01))
+        none = jnp.zeros(count)
+        points = PolylinePoint(places, towards, none, none < 1.0, jnp.zeros((count, 2, 3)))
+        return gaussians, *learned_media.move(params, _CONFIG, domain, gaussians, points, _ONE)
+
+    gaussians, moved, seen, bent = move(params, places, towards)
     assert moved.positions.shape == (count, 4, 3) and moved.scales.shape == (count, 4)
     np.testing.assert_array_equal(moved.positions[:, :2], gaussians.positions)
     offsets = _moved(params, places).position

@@ -44,7 +44,12 @@ def run_command(command, *options, fails=False, env=None):
 
     In the suite's environment, whose code generator is the faster one, if `env` is not given.
     """
-    arguments = (f"experiments.{command}", *map(str, options))
+    return run_module(f"experiments.{command}", *options, fails=fails, env=env)
+
+
+def run_module(module, *options, fails=False, env=None):
+    """Runs `python -m {module}` likewise."""
+    arguments = (module, *map(str, options))
     with tempfile.TemporaryDirectory() as folder:
         out, err = (Path(folder, name) for name in ("out", "err"))
         environment = dict(os.environ if env is None else env)

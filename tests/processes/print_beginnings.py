@@ -1,6 +1,7 @@
 """Begins many trainings in one process, without a step, and prints what each came to.
 
-Reads a JSON list of lists of options, or of "copy" and two folders; prints a JSON list of records.
+Reads the file that is named: a JSON list of lists of options, or of "copy" and two folders; prints
+a JSON list of records.
 """
 
 import contextlib
@@ -53,4 +54,5 @@ if __name__ == "__main__":
     fit.train = lambda run, **where: True
     scene_analysis.fit_size_by_parallax = lambda *_, **options: None
     report._HEIGHT = 40
-    json.dump([_begin(options) for options in json.load(sys.stdin)], sys.stdout)
+    begun = json.loads(Path(sys.argv[1]).read_text())
+    json.dump([_begin(options) for options in begun], sys.stdout)

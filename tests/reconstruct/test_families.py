@@ -73,8 +73,8 @@ def torus():
 @pytest.fixture(
     scope="module",
     params=[
-        *(pytest.param(name, marks=pytest.mark.slow) for name in ("cylinder", "ring")),
-        *("vase", "cup"),
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("cylinder", "ring", "vase")),
+        "cup",
     ],
 )
 def fitted(request):
@@ -246,7 +246,12 @@ def _bottle(*, sides, ridges, lump=0.0):
 
 @pytest.mark.parametrize(
     ("sides", "ridges", "lump", "furthest"),
-    [(5, 0.3, 0.0, 0.04), (5, 0.3, 0.3, 0.04), (5, 0.1, 0.3, 0.03), (3, 0.2, 0.0, 0.03)],
+    [
+        pytest.param(5, 0.3, 0.0, 0.04, marks=pytest.mark.slow),
+        (5, 0.3, 0.3, 0.04),
+        pytest.param(5, 0.1, 0.3, 0.03, marks=pytest.mark.slow),
+        (3, 0.2, 0.0, 0.03),
+    ],
 )
 def test_the_axis_of_a_bottle_with_ridges(sides, ridges, lump, furthest):
     mesh = _bottle(sides=sides, ridges=ridges, lump=lump)

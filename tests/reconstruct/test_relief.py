@@ -159,7 +159,7 @@ def test_parts_of_a_vessel_with_a_relief_are_closed_and_nested(relief):
         np.testing.assert_array_equal(liquid.vertices[:, 2], plain.vertices[:, 2])
 
 
-@pytest.mark.parametrize("mouth", [False, True])
+@pytest.mark.parametrize("mouth", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_offsets_of_a_relief_move_all_parts_as_their_derivatives_say(relief, mouth):
     body = vessels.bottle().with_relief(Relief(-1.0, 0.05, relief.factors))
     detail = Detail(outer=48, ridges=0, inner=64, azimuths=48)

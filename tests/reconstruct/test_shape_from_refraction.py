@@ -470,6 +470,7 @@ def test_a_free_surface_that_gains_nothing_on_a_family_ends(
     assert len(count) == fits and count[0] > 500
 
 
+@pytest.mark.slow
 def test_a_free_surface_that_explains_all_of_a_black_world_ends(ball, seen, judges, monkeypatch):
     monkeypatch.setattr(
         shape_from_refraction, "FreeSurface", functools.partial(FreeSurface, spacing=0.5)

@@ -120,7 +120,9 @@ def test_without_offsets_a_ray_is_straight(kind, space):
     np.testing.assert_allclose(found.bent.turned, found.bent.straight, atol=_ROUNDING)
 
 
-@pytest.mark.parametrize("kind", _KINDS)
+@pytest.mark.parametrize(
+    "kind", ["raydef", pytest.param("raydef_polyline", marks=pytest.mark.slow)]
+)
 def test_an_untrained_ray_is_nearly_straight(kind):
     config = _config(kind)
     params = jax.jit(lambda: init_params(jax.random.key(3), config))()

@@ -192,6 +192,7 @@ def test_histograms_are_sorted_and_hold_all_light(interior):
     assert np.isfinite(distances).all() and (distances >= config.near).all()
 
 
+@pytest.mark.slow
 def test_rendering_many_paths_is_a_loop():
     paths = _some_paths()
     together = _render(_CLEAR, paths)

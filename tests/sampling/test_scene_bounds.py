@@ -370,7 +370,13 @@ def test_the_unit_cube_is_around_the_centre():
     np.testing.assert_allclose(found.scales, 0.1, rtol=1e-6)
 
 
-@pytest.mark.parametrize("space", _SPACES)
+@pytest.mark.parametrize(
+    "space",
+    [
+        pytest.param(space, marks=() if space == "unbounded" else pytest.mark.slow)
+        for space in _SPACES
+    ],
+)
 def test_what_is_moved_as_a_whole_is_the_same(space):
     usual, moved = Domain(2.0, space), Domain(2.0, space, _CENTRE)
     rng = np.random.default_rng(0)

@@ -105,13 +105,16 @@ def test_a_model_is_loaded_without_a_word_and_nothing_is_written(four, caplog, c
     assert before == {path: path.stat().st_mtime_ns for path in four.rglob("*")}
 
 
-def test_what_is_asked_for_stays_where_the_path_of_the_scene_is_made_absolute(monkeypatch):
-    monkeypatch.chdir(ROOT / "experiments" / "data")
-    asked = {"paths": "straight", "background": "spherical", "radius": 9.0}
+def test_what_is_asked_for_stays_where_the_path_of_the_scene_is_made_absolute(
+    monkeypatch, tmp_path
+):
+    small_scenes.write_scene(tmp_path / "cube_smcvx_ball")
+    monkeypatch.chdir(tmp_path)
+    asked = {"paths": "straight", "background": "spherical", "radius": 9.0, "batch": 16}
     config = TrainConfig().override(scene="cube_smcvx_ball", **asked)
     made, _ = fit.prepare(config, report=lambda line: None)
     assert {name: made.config.get(name) for name in asked} == asked
-    assert made.config.scene.path == str(ROOT / "experiments" / "data" / "cube_smcvx_ball")
+    assert made.config.scene.path == str(tmp_path / "cube_smcvx_ball")
 
 
 def test_fit_refuses_what_names_no_run(tmp_path):

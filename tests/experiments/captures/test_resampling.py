@@ -57,7 +57,9 @@ def _expected(pinhole, **options):
 
 
 @pytest.mark.parametrize(
-    "distortion", [_BARREL, _CUSHION, _FISHEYE], ids=["barrel", "cushion", "fisheye"]
+    "distortion",
+    [_BARREL, pytest.param(_CUSHION, marks=pytest.mark.slow), _FISHEYE],
+    ids=["barrel", "cushion", "fisheye"],
 )
 def test_a_known_pattern_comes_back_without_its_distortion(distortion):
     frame = _frame(distortion, size=(60, 44), focal=(55.0, 56.0), centre=(30.4, 21.7))

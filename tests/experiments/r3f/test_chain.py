@@ -26,7 +26,7 @@ from experiments.r3f import (
 from experiments.r3f.records import ReconstructionConfig
 from refref_jax.data import meshes, scene_folder
 from refref_jax.geometry.triangle_meshes import corner_normals, make_mesh
-from refref_jax.reconstruct import opaque_ends
+from refref_jax.reconstruct import opaque_ends, refinement
 from refref_jax.reconstruct.bubbles import Bubble, ObjectWithBubbles
 from refref_jax.reconstruct.contents import COARSE, Interior
 from refref_jax.reconstruct.gauss_newton import Fit
@@ -34,6 +34,7 @@ from refref_jax.reconstruct.interiors import Vessel
 from refref_jax.reconstruct.mesh_distance import compare_meshes
 from refref_jax.reconstruct.model_selection import Trial
 from refref_jax.reconstruct.opaque_ends import OpaqueEnd
+from refref_jax.reconstruct.refinement import Refinement
 from refref_jax.reconstruct.refractive_index import Descent, IndexEstimate
 from refref_jax.reconstruct.shape_from_refraction import SingleObject
 from refref_jax.reconstruct.shapes import FixedShape, mesh_of
@@ -43,6 +44,8 @@ from tests.factories.silhouettes import RADIUS, without_masks, write_scene
 from tests.factories.small_scenes import write_grey
 
 pytestmark = pytest.mark.longest
+
+_UNREFINED = Refinement(denoising=0.0, corners=0)
 
 _CONFIG = ReconstructionConfig("hull", 20, 0, 1.5, None, None, "none", 0)
 
@@ -331,7 +334,9 @@ def _with_validation(scene, target):
 _LIT = dataclasses.replace(_CONFIG, refinement="light")
 
 
-@pytest.mark.parametrize(("after", "kept"), [(0.03, True), (0.05, False)])
+@pytest.mark.parametrize(
+    ("after", "kept"), [(0.03, True), pytest.param(0.05, False, marks=pytest.mark.slow)]
+)
 def test_light_is_kept_only_where_validation_views_say_so(
     scene, whole, tmp_path, monkeypatch, after, kept
 ):
@@ -514,6 +519,9 @@ def test_before_a_field_there_is_no_refinement_by_light(scene, whole, tmp_path, 
     monkeypatch.setattr(index_stage, "learn_backdrop", lambda *_, **options: None)
     monkeypatch.setattr(light_stage, "fit", None)  # would raise
     monkeypatch.setattr(geometry_stage, "shape_from_outlines", lambda *_, **options: None)
+    # The surface is made again, now with families of shapes, and tested elsewhere.
+    few = lambda mesh, settings, views: refinement.refine(mesh, _UNREFINED, views=views)
+    monkeypatch.setattr(geometry_stage, "refine", few)
     found = _run(scene, out, _LIT, compare=False)
     assert found.light == records.LightFacts(
         False, 1.5, remark="the background is a field, not a surface at a known place"

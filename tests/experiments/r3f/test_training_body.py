@@ -1,15 +1,13 @@
 """Training with a reconstructed body: which options ask for it, and that it never reads meshes."""
 
 import json
-import subprocess
-import sys
 
 import pytest
 
 from experiments.r3f import chain, records, report
 from experiments.r3f.records import ReconstructionConfig
 from tests.factories.silhouettes import write_scene
-from tests.processes.command import ROOT, run_command
+from tests.processes.command import run_command, run_module
 
 pytestmark = pytest.mark.longest
 
@@ -138,15 +136,8 @@ def found(scene, made, runs, moved):
     sent.append([f"--out={made}", f"--scene={scene}", given])
     left = {"scene": {"path": str(scene), "reconstruction": "r3f"}}
     (moved / "gone" / "run" / "config.json").write_text(json.dumps(left))
-    result = subprocess.run(
-        [sys.executable, "-m", "tests.processes.print_beginnings"],
-        cwd=ROOT,
-        input=json.dumps(sent),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert result.returncode == 0, result.stderr
+    (moved / "options.json").write_text(json.dumps(sent))
+    result = run_module("tests.processes.print_beginnings", moved / "options.json")
     names = [*cases, *again, *on_top, "run in its body"]
     return dict(zip(names, json.loads(result.stdout), strict=True))
 
