@@ -51,7 +51,7 @@ def _psnr(image, target, mask):
 @pytest.mark.parametrize(
     ("settings", "at_least", "at_most"),
     [
-        (STRAIGHT, 8.0, 13.0),
+        pytest.param(STRAIGHT, 8.0, 13.0, marks=pytest.mark.slow),
         pytest.param(PathSettings(10, "none"), 22.0, 28.0, marks=pytest.mark.slow),
         pytest.param(PAPER, 27.0, 33.0, marks=pytest.mark.slow),
         (TREE, 41.5, 48.0),

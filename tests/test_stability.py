@@ -9,11 +9,13 @@ from benchmarks.stability.measures import MEASURES
 pytestmark = pytest.mark.longest
 
 
-# In double precision, and what `tests/geometry/test_hit_robustness.py` has of single hits.
+# In double precision, what `tests/geometry/test_hit_robustness.py` has of single hits, and scales
+# beside those of powers of two.
 _SLOW = (
     "ball, float64",
     "slabs of all ratios and angles, float64",
     "offsets 1 to 1e4",
+    "scales 1e-3 to 1e3",
     "triangles of aspect 1e4 to 1e6",
     "spheres of 80 triangles and more",
     "in faces and along edges",

@@ -18,6 +18,9 @@ _CENTRE, _RADIUS = (0.3, -0.2, 0.1), 2.0
 _TOWARDS = jnp.array([0.36, 0.48, 0.8], jnp.float32)
 
 
+_seen = jax.jit(registry.radiance, static_argnums=1)
+
+
 def _config(**changes):
     return tnsr.TnsrConfig(
         _GRID,
@@ -63,9 +66,11 @@ def test_values_and_slopes_are_those_of_neus():
         seen = neus.radiance(params, opaque, Gaussians(cell[None], jnp.zeros(1)), _TOWARDS)
         return _RADIUS * seen.signed
 
-    np.testing.assert_allclose(surface.values(point[None])[0], value(point), rtol=1e-5)
+    values = jax.jit(lambda at: surface.values(at))
+    np.testing.assert_allclose(values(point[None])[0], value(point), rtol=1e-5)
     step = 2.0 * _RADIUS / _GRID.max_res
-    ends = [[value(point + s * step * axis) for axis in jnp.eye(3)] for s in (1.0, -1.0)]
+    moves = np.float32(step * np.eye(3))
+    ends = [[value(np.asarray(point) + s * move) for move in moves] for s in (1, -1)]
     expected = (np.array(ends[0]) - np.array(ends[1])) / (2.0 * step)
     np.testing.assert_allclose(jax.jit(slope)(surface, point), expected, rtol=1e-4, atol=1e-5)
 
@@ -79,9 +84,9 @@ def test_light_comes_from_behind_the_ball_only(place, seen):
     config = _config()
     params = _trained(config)
     at = Gaussians(jnp.asarray(place, jnp.float32)[None], jnp.zeros(1, jnp.float32))
-    found = registry.radiance(params, config, at, _TOWARDS)
+    found = _seen(params, config, at, _TOWARDS)
     assert (float(found.density) > 0.0) == seen
-    around = neus.radiance(params, tnsr.opaque(config), at, _TOWARDS)
+    around = _seen(params, tnsr.opaque(config), at, _TOWARDS)
     if seen:
         np.testing.assert_allclose(found.density, around.density, rtol=1e-5)
         np.testing.assert_allclose(found.rgb, around.rgb, rtol=1e-5)

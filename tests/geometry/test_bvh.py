@@ -85,7 +85,9 @@ def test_the_division_of_another_number_of_faces_is_refused():
         bvh_build.build(np.float32(_soup(40)), division=bvh_build.divide(np.float32(_soup(39))))
 
 
-@pytest.mark.parametrize("faces", [1, 2, 5, 40, 400])
+@pytest.mark.parametrize(
+    "faces", [1, *(pytest.param(few, marks=pytest.mark.slow) for few in (2, 5)), 40, 400]
+)
 def test_hits_of_random_rays_equal_brute_force(faces):
     triangles = _soup(faces)
     origins, directions = _random_rays(200)
@@ -120,7 +122,7 @@ def test_a_ray_in_the_plane_of_a_triangle_misses():
 
 
 @pytest.mark.parametrize("target", ["vertices", "edges", "faces"])
-@pytest.mark.parametrize("subdivisions", [1, 3])
+@pytest.mark.parametrize("subdivisions", [pytest.param(1, marks=pytest.mark.slow), 3])
 def test_no_ray_slips_through_a_closed_surface(target, subdivisions):
     mesh = trimesh.creation.icosphere(subdivisions=subdivisions)
     points = {

@@ -21,6 +21,9 @@ from tests.factories import scenes
 _DEPTH = 4
 
 
+_follow = jax.jit(follow_branch, static_argnames="settings")
+
+
 def _every_choice():
     return np.array(list(itertools.product([False, True], repeat=_DEPTH)))
 
@@ -97,7 +100,7 @@ def test_the_choices_must_fit_the_budget():
 def test_without_bends_nothing_is_traced():
     ray = jax.tree.map(lambda x: x[0], scenes.rays([-4.0, 0.0, 0.0], [1.0, 0.0, 0.0]))
     nowhere = jnp.zeros(0, bool)
-    path = follow_branch(scenes.build(scenes.box()), ray, nowhere, settings=STRAIGHT)
+    path = _follow(scenes.build(scenes.box()), ray, nowhere, settings=STRAIGHT)
     assert (int(path.statuses), int(path.num_bends)) == (PathStatus.NOT_TRACED, 0)
     np.testing.assert_array_equal(path.throughput, 1.0)
 
@@ -107,7 +110,7 @@ def test_a_path_that_runs_out_of_bends_is_as_bright_as_the_budget_says(truncated
     slab = scenes.build(scenes.box((20.0, 20.0, 0.5)))
     settings = PathSettings(1, "all", truncated_paths=truncated_paths)
     ray = _ray([0.3, 0.2, 3.0], [0.0, 0.0, -1.0])
-    path = follow_branch(slab, ray, jnp.zeros(1, bool), settings=settings)
+    path = _follow(slab, ray, jnp.zeros(1, bool), settings=settings)
     assert path.statuses == PathStatus.OUT_OF_BENDS
     np.testing.assert_allclose(path.throughput, weight, rtol=1e-5)
 
@@ -116,7 +119,7 @@ def test_a_path_that_is_cut_weighs_nothing():
     scene = scenes.build(scenes.box((20.0, 20.0, 0.5)))
     ray = jax.tree.map(lambda x: x[0], scenes.rays([0.0, 0.1, 3.0], [0.0, 0.0, -1.0]))
     settings = PathSettings(2, "all", min_throughput=0.039)
-    inner = follow_branch(scene, ray, jnp.array([False, True]), settings=settings)
+    inner = _follow(scene, ray, jnp.array([False, True]), settings=settings)
     np.testing.assert_array_equal(inner.throughput, 0.0)
 
 
@@ -227,8 +230,11 @@ def test_gradients_at_the_critical_angle_are_finite():
     off = np.array([0.0, 1e-7, -1e-7, 1e-5, -1e-5, 1e-3, -1e-3])
     theta = np.arcsin(1.0 / 1.5) + off
     rays = scenes.rays(np.zeros((7, 3)), np.stack([np.sin(theta), 0.0 * off, np.cos(theta)], -1))
-    for derivative in (jax.jacfwd, jax.jacrev):
-        slopes = jax.jit(jax.vmap(derivative(leave), in_axes=(None, 0)))(jnp.float32(1.5), rays)
+
+    def both(index, ray):
+        return [derivative(leave)(index, ray) for derivative in (jax.jacfwd, jax.jacrev)]
+
+    for slopes in jax.jit(jax.vmap(both, in_axes=(None, 0)))(jnp.float32(1.5), rays):
         assert np.all(np.isfinite(slopes))
         # Beyond the critical angle nothing depends on the index.
         np.testing.assert_array_equal(slopes[np.array([3, 5])], 0.0)

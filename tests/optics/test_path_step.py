@@ -12,6 +12,9 @@ from refref_jax.optics.path_settings import PathSettings
 _GLASS = jax.tree.map(jnp.asarray, interface_rules.nested([1.5], [NO_PARENT]))
 
 
+_interact = jax.jit(path_step.interact)
+
+
 def _meet(direction, shading=(0.0, 0.0, 1.0)):
     """Meets a glass surface z = 0 that faces up; the shading normal may lean."""
     shading = np.asarray(shading) / np.linalg.norm(shading)
@@ -24,7 +27,7 @@ def _meet(direction, shading=(0.0, 0.0, 1.0)):
     )
     unit = np.asarray(direction) / np.linalg.norm(direction)
     nowhere = media.empty_interior_list(_GLASS)
-    return path_step.interact(point, _GLASS, nowhere, jnp.asarray(unit, jnp.float32))
+    return _interact(point, _GLASS, nowhere, jnp.asarray(unit, jnp.float32))
 
 
 def test_entering_glass():
@@ -82,24 +85,26 @@ def test_a_shading_normal_that_points_away_from_the_ray_is_not_used():
     np.testing.assert_array_equal(flat.transmitted, leaning.transmitted)
 
 
+@jax.jit
+@jax.grad
+def _slope_of_turned(shading):
+    point = SurfacePoint(
+        position=jnp.zeros(3),
+        geometric_normal=jnp.array([0.0, 0.0, 1.0]),
+        shading_normal=shading,
+        part=jnp.int32(0),
+        scale=jnp.float32(1.0),
+    )
+    direction = jnp.array([1.0, 0.0, -0.2]) / np.hypot(1.0, 0.2)
+    nowhere = media.empty_interior_list(_GLASS)
+    met = path_step.interact(point, _GLASS, nowhere, direction)
+    return jnp.sum(met.reflected * jnp.array([1.0, 2.0, 3.0])) + met.transmitted[2]
+
+
 @pytest.mark.parametrize("degrees", [0.0, 7.0, 11.3])
 def test_slopes_are_finite_where_a_ray_is_turned(degrees):
     lean = np.radians(degrees)
-
-    def turned(shading):
-        point = SurfacePoint(
-            position=jnp.zeros(3),
-            geometric_normal=jnp.array([0.0, 0.0, 1.0]),
-            shading_normal=shading,
-            part=jnp.int32(0),
-            scale=jnp.float32(1.0),
-        )
-        direction = jnp.array([1.0, 0.0, -0.2]) / np.hypot(1.0, 0.2)
-        nowhere = media.empty_interior_list(_GLASS)
-        met = path_step.interact(point, _GLASS, nowhere, direction)
-        return jnp.sum(met.reflected * jnp.array([1.0, 2.0, 3.0])) + met.transmitted[2]
-
-    slope = jax.grad(turned)(jnp.array([np.sin(lean), 0.0, np.cos(lean)], jnp.float32))
+    slope = _slope_of_turned(jnp.array([np.sin(lean), 0.0, np.cos(lean)], jnp.float32))
     assert np.all(np.isfinite(slope))
 
 
@@ -156,9 +161,7 @@ def test_light_that_a_facet_sends_to_the_wrong_side_is_hidden():
     hidden = 0
     for slope in np.linspace(-2.0, 2.0, 21):
         direction = jnp.array([1.0, 0.0, -0.3]) / np.hypot(1.0, 0.3)
-        met = path_step.interact(
-            point, rough, nowhere, direction, tilt=jnp.array([slope, 0.0], jnp.float32)
-        )
+        met = _interact(point, rough, nowhere, direction, tilt=jnp.array([slope, 0.0], jnp.float32))
         assert met.reflected[2] > 0.0 > met.transmitted[2] or met.total
         hidden += bool(met.unmasked[0] == 0.0)
     assert 0 < hidden < 21

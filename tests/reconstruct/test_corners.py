@@ -164,6 +164,7 @@ def test_one_bad_mask_moves_no_corner_far(bad):
     )
 
 
+@pytest.mark.slow
 def test_masks_eroded_by_a_pixel_shrink_the_box_by_a_pixel():
     masks, cameras = _views(_turned_box)
     views = Views(np.stack([binary_erosion(mask) for mask in masks]), cameras)

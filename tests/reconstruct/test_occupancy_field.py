@@ -31,6 +31,9 @@ def _ball(position, *, radius=0.25):
     return jnp.linalg.norm(position - 0.5) - radius
 
 
+_scan = jax.jit(scan, static_argnums=0, static_argnames="samples")
+
+
 def test_weights_are_known_by_hand():
     found = weights(single([0.5, 0.0, 0.5, 1.0, 0.7]))
     np.testing.assert_allclose(found, [0.5, 0.0, 0.25, 0.25, 0.0], atol=1e-7)
@@ -55,14 +58,17 @@ def test_gradients_by_weights_are_finite_where_all_or_nothing_is_stopped(occupan
     assert gradients.all_finite(slopes)
 
 
+@jax.jit
+@jax.value_and_grad
+def _loss(logits, seen):
+    return cross_entropy(silhouette_logit(logits), seen)
+
+
 @pytest.mark.parametrize("size", [0.0, 1.0, 1e3, 1e6, 1e30])
 @pytest.mark.parametrize("signs", [(1, 1, 1), (-1, -1, -1), (1, -1, -1), (-1, -1, 1)])
 @pytest.mark.parametrize("seen", [0.0, 1.0])
 def test_the_loss_and_its_gradient_are_finite_for_any_logits(size, signs, seen):
-    def loss(logits):
-        return cross_entropy(silhouette_logit(logits), _one(seen))
-
-    value, slopes = jax.value_and_grad(loss)(size * single(signs))
+    value, slopes = _loss(size * single(signs), _one(seen))
     assert np.isfinite(value) and value >= 0.0 and gradients.all_finite(slopes)
     pulled, most = np.abs(slopes).sum(), signs.count(max(signs))
     if size > 1.0 and seen == 0.0:
@@ -83,7 +89,7 @@ def test_the_cross_entropy_is_known_by_hand():
 
 
 def test_a_scan_finds_the_deepest_place_and_the_surface():
-    found = scan(_ball, _chord(0.1), _one(0.5), samples=40)
+    found = _scan(_ball, _chord(0.1), _one(0.5), samples=40)
     assert abs(found.deepest - 1.5) <= found.spacing + 1e-6
     assert found.meets == 1.0
     np.testing.assert_allclose(found.surface, 1.5 - np.sqrt(0.25**2 - 0.1**2), atol=2e-3)
@@ -91,7 +97,7 @@ def test_a_scan_finds_the_deepest_place_and_the_surface():
 
 
 def test_a_scan_that_meets_nothing_says_where_it_came_closest():
-    found = scan(_ball, _chord(0.3), _one(0.5), samples=40)
+    found = _scan(_ball, _chord(0.3), _one(0.5), samples=40)
     assert found.meets == 0.0
     assert abs(found.surface - 1.5) <= 0.5 / 40 + 1e-6
     assert abs(found.deepest - 1.5) <= found.spacing + 1e-6 and found.spacing < 0.1 / 40
@@ -101,19 +107,19 @@ def test_an_edge_between_two_samples_is_found():
     def wedge(position):
         return jnp.sum(jnp.abs(position[:2] - 0.5)) - 0.25
 
-    found = scan(wedge, _chord(0.245), _one(0.1), samples=10)
+    found = _scan(wedge, _chord(0.245), _one(0.1), samples=10)
     assert abs(found.deepest - 1.5) <= found.spacing + 1e-6
     assert wedge(at(_chord(0.245), found.deepest)) < 0.0
 
 
 def test_a_scan_that_starts_inside_meets_no_surface():
     chord = _chord()._replace(starts=_one(1.5))
-    assert scan(_ball, chord, _one(0.5), samples=20).meets == 0.0
+    assert _scan(_ball, chord, _one(0.5), samples=20).meets == 0.0
 
 
 def test_a_chord_of_no_length_is_seen_as_one_point():
     chord = _chord()._replace(ends=_one(1.0))
-    found = scan(_ball, chord, _one(0.5), samples=4)
+    found = _scan(_ball, chord, _one(0.5), samples=4)
     assert all(np.isfinite(value) for value in found) and found.deepest == 1.0
     logit = logit_along(_ball, chord, found, jnp.full(4, 0.5), softness=_one(0.1))
     # Four samples of one point, 0.25 from the ball.
@@ -145,11 +151,11 @@ def test_gradients_reach_the_field_and_none_flow_through_the_scan():
         logit = logit_along(signed, _chord(0.25), looked, jnp.full(2, 0.5), softness=_one(0.05))
         return logit + 0.0 * looked.surface
 
-    slope = jax.grad(total)(_one(0.25), _one(0.5))
+    slope = jax.jit(jax.grad(total))(_one(0.25), _one(0.5))
     assert np.isfinite(slope) and 0.9 / 0.05 < slope < 3.0 / 0.05
     looked = functools.partial(scan, chord=_chord(), shift=_one(0.5), samples=9)
 
     def deepest(radius):
         return looked(functools.partial(_ball, radius=radius)).deepest
 
-    assert jax.grad(deepest)(_one(0.25)) == 0.0
+    assert jax.jit(jax.grad(deepest))(_one(0.25)) == 0.0

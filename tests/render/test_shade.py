@@ -1,6 +1,7 @@
 """Paths and a radiance function to colours."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +17,8 @@ from tests.factories import scenes
 from tests.laws import gradients
 
 
+@functools.cache
+@jax.jit
 def _paths():
     """Two straight paths of ray 1, one of ray 0, and an empty slot that looks nowhere."""
     rays = scenes.rays(np.zeros((4, 3)), [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]])
@@ -28,35 +31,38 @@ def _paths():
     )
 
 
+_shade = jax.jit(shade, static_argnums=1, static_argnames="rays")
+
+
 def _unit_direction(origin, direction):
     # Of a zero direction it is no number.
     return direction / jnp.sqrt(jnp.sum(jnp.square(direction)))
 
 
 def test_a_ray_is_the_weighted_sum_of_its_paths():
-    seen = shade(_paths(), _unit_direction, rays=3)
+    seen = _shade(_paths(), _unit_direction, rays=3)
     np.testing.assert_allclose(seen, [[0, 0, 0.5], [0.75, 0.25, 0], [0, 0, 0]], atol=1e-7)
 
 
 def test_an_empty_slot_brings_neither_light_nor_gradient():
-    def light(scale):
-        return jnp.sum(shade(_paths(), lambda o, d: _unit_direction(o, scale * d), rays=2))
+    def light(scale, paths):
+        return jnp.sum(shade(paths, lambda o, d: _unit_direction(o, scale * d), rays=2))
 
-    value, slope = jax.value_and_grad(light)(jnp.float32(2.0))
+    value, slope = jax.jit(jax.value_and_grad(light))(jnp.float32(2.0), _paths())
     assert gradients.all_finite((value, slope))
     np.testing.assert_allclose(slope, 0.0, atol=1e-6)
 
 
 def test_the_last_segment_is_what_is_seen():
     """Only as many segments count as are used; a slot without any has some segment."""
-    straight = light_paths.straight(scenes.rays(np.zeros((2, 3)), np.eye(3)[:2]))
+    straight = jax.jit(light_paths.straight)(scenes.rays(np.zeros((2, 3)), np.eye(3)[:2]))
     bent = straight._replace(
         points=jnp.arange(18.0).reshape(2, 3, 3),
         directions=jnp.arange(18.0, 36.0).reshape(2, 3, 3),
         tau=jnp.array([[0.0, 2.0, jnp.inf], [jnp.inf, jnp.inf, jnp.inf]]),
         media=jnp.array([[0, 1, 7], [5, 7, 7]], jnp.int32),
     )
-    ends = light_paths.ends_of(bent)
+    ends = jax.jit(light_paths.ends_of)(bent)
     np.testing.assert_array_equal(ends.origins, [[3, 4, 5], [9, 10, 11]])
     np.testing.assert_array_equal(ends.directions, [[21, 22, 23], [27, 28, 29]])
     np.testing.assert_array_equal(ends.tau[0], 2.0)
@@ -65,7 +71,7 @@ def test_the_last_segment_is_what_is_seen():
 
 def test_one_path_alone_is_shaded_too():
     one = jax.tree.map(lambda x: x[0], _paths())._replace(rays=jnp.int32(0))
-    np.testing.assert_allclose(shade(one, _unit_direction, rays=1), [[0.75, 0, 0]], atol=1e-7)
+    np.testing.assert_allclose(_shade(one, _unit_direction, rays=1), [[0.75, 0, 0]], atol=1e-7)
 
 
 def test_paths_of_mapped_rays_are_refused_with_the_remedy():

@@ -19,7 +19,6 @@ from refref_jax.splats.gaussians import Gaussians, read_ply
 from refref_jax.training import fit, presets, run_folder
 from refref_jax.training.config import TrainConfig
 from tests.factories.small_model import CAMERAS
-from tests.factories.small_scenes import write_scene
 from tests.laws import expectations
 from tests.processes.command import ROOT, run_command
 
@@ -147,8 +146,7 @@ def test_commands_take_a_run(trained, tmp_path):
 
 
 def test_several_devices_are_refused(tmp_path):
-    small = write_scene(tmp_path / "cube_smcvx_ball", frames=24)
-    resolved, scene = fit.prepare(_config().override(scene=str(small)), report=_quiet)
+    resolved, scene = fit.prepare(_config(), report=_quiet)
     fit.begin(tmp_path / "run", resolved.config, resolved.model, scene)
     with pytest.raises(ValueError, match="one device in one process"):
         fit.train(tmp_path / "run", mesh=jax.make_mesh((1,), ("batch",)))
