@@ -65,7 +65,7 @@ def _dtype_promotion(request):
 
 @pytest.fixture(autouse=True, scope="module")
 def _strict_fixtures(request):
-    """What fixtures of a module have traced under another setting, its tests would trace again."""
+    """Traces fixtures of a module under its tests' setting, or else tests trace them again."""
     with _dtype_promotion(request):
         yield
 

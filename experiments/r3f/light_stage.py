@@ -284,10 +284,10 @@ def look_at_ends(
     if outer is None or outer.closed:
         return RevolvedObject(None)
     with ProgressBar("profile", 2) as bar:
-        bar.show(0, "fitted to the outlines")
+        bar.show(0, "fitting to the outlines")
         relief = measure_relief(mesh, outer.axis)
         outer = fit_profile(outer, read_views(scene), relief=relief, seed=seed)
-        bar.show(1, "looks for opaque ends")
+        bar.show(1, "looking for opaque ends")
         ends = opaque_ends.find_opaque_ends(outer, surface, seen.fitted, seed=seed)
         bar.show(2, "done")
     return RevolvedObject(outer, ends)

@@ -2,8 +2,9 @@
 
 The inner wall is a level set of the distance from the outer one, above a flat base. Both are free
 surfaces (`shapes.FreeSurface`). The inner one follows the outer one, so that the wall keeps its
-thickness where light says nothing, and has handles of its own besides, fewer. The last steps have
-handles at half of the distance: coarse ones leave normals 3 degrees off on a figure with limbs.
+thickness where light says nothing, and has handles of its own besides, fewer. Their displacements
+fade before they reach the outer wall. In the last steps, handles are half as far apart: at 1/44 of
+the diameter they cannot represent the normals of a figure with limbs to better than 3 degrees.
 
 What this cannot represent: the surface of a liquid, and open mouths.
 
@@ -13,7 +14,7 @@ Source: ours.
 import contextlib
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +22,7 @@ import scipy.sparse
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
-from refref_jax.geometry.triangle_meshes import Mesh, diameter
+from refref_jax.geometry.triangle_meshes import Mesh, diameter, with_short_edges
 from refref_jax.reconstruct import ReconstructionError, gauss_newton, photometry
 from refref_jax.reconstruct.contents import GLASS_DEVIATION, Interior, Layout
 from refref_jax.reconstruct.gauss_newton import Candidate, Rows, Steps
@@ -35,9 +36,15 @@ from refref_jax.reconstruct.shapes import FreeSurface, Posed, mesh_of
 # Distance between the points of the grid of distances, as a share of the diameter.
 _SPACING = 1.0 / 150.0
 
-# Distances between the handles of the outer and of the inner wall in the first steps and in the
-# finest ones, as shares of the diameter.
+# Distances between the handles of the outer and of the inner wall, as shares of the diameter, in
+# all steps but the finest ones, and in these. Beyond this number of unknowns (0.3 GB a matrix) they
+# are further apart.
 _COARSE, _FINE = (1.0 / 44.0, 1.0 / 24.0), (1.0 / 88.0, 1.0 / 44.0)
+_MOST = 6000
+
+# Share of its depth by which the inner wall may come nearer to the outer one, and least depth, as a
+# share of the diameter.
+_OUTWARDS, _THINNEST = 0.75, 1e-4
 
 # Standard deviations of the inner wall's own handles: minus the mean of their neighbours, and in
 # all, in the units of `FreeSurface`.
@@ -47,7 +54,8 @@ _ROUGHNESS, _OFFSET = 0.006, 0.04
 # blur of its backdrop, in halvings.
 _WALLS, _BASES, _PIXELS, _BLUR = (0.008, 0.014, 0.022, 0.035, 0.055), (0.0, 0.045), 3000, 1
 
-# Blurs of the first steps, which choose the contents, and of the others; number of pixels of each.
+# Blurs of the first steps, which choose the contents, of the others, and of the finest ones; number
+# of pixels of each.
 _FIRST, _OTHERS, _FINEST = (2, 2, 1), (1, *[0] * 15), (0,) * 12
 _FIRST_RAYS, _RAYS, _FINEST_RAYS, _JUDGES = 12_000, 24_000, 48_000, 8192
 
@@ -108,9 +116,18 @@ class FreeVessel(Vessel):
         outer: Mesh,
         inner: Mesh,
         interior: Interior,
+        *,
         spacings: tuple[float, float] = _COARSE,
+        expected: Interior | None = None,
     ) -> None:
-        """Takes both walls, what is inside, and the distances between the handles of each wall.
+        """Places the handles.
+
+        Args:
+          outer: outer wall.
+          inner: inner wall.
+          interior: contents to begin with.
+          spacings: distances between the handles of both walls, as shares of the diameter.
+          expected: contents whose indices of refraction the prior expects; `interior` by default.
 
         Raises:
           ReconstructionError: if the contents have a surface.
@@ -121,27 +138,49 @@ class FreeVessel(Vessel):
                 "these, or a body of revolution."
             )
         self.interior_at_start, self.size = interior, diameter(outer.vertices)
-        of_outer, of_inner = (spacing * self.size for spacing in spacings)
-        self._outer_surface = FreeSurface(outer, of_outer)
-        self._inner_surface = FreeSurface(inner, of_inner, roughness=_ROUGHNESS, size=_OFFSET)
+        self._expected = interior if expected is None else expected
+        outer_spacing, inner_spacing = (spacing * self.size for spacing in spacings)
+        self._outer_surface = FreeSurface(outer, outer_spacing)
+        self._inner_surface = FreeSurface(inner, inner_spacing, roughness=_ROUGHNESS, size=_OFFSET)
         nearest = KDTree(outer.vertices).query(inner.vertices)[1]
         weights = [self._outer_surface.weights[nearest], self._inner_surface.weights]
         self.layout = Layout(
             interior, weights[0].shape[1], len(self._inner_surface.handles), axis=0
         )
+        depths = -signed_distance(outer)(inner.vertices[self._inner_surface.handles])
+        self._room = _OUTWARDS * np.maximum(depths, _THINNEST * self.size)
         self._inner_surface.weights = scipy.sparse.hstack(weights).tocsr()
 
     def finer(self, x: Float[np.ndarray, " unknowns"]) -> "FreeVessel":
-        """Returns the vessel of given unknowns as one at rest that has more handles."""
+        """Returns the vessel of given unknowns as one at rest that has more handles.
+
+        Its prior expects no displacements from there, and the same indices of refraction.
+
+        Raises:
+          ReconstructionError: if a wall is inside out.
+        """
         outer, inner = (mesh_of(wall) for wall in self._surfaces(x))
-        return FreeVessel(outer, inner, self.interior(x), _FINE)
+        now, known = self.interior(x), self._expected
+        found = FreeVessel(outer, inner, now, spacings=_FINE, expected=known)
+        if found.layout.count <= _MOST:
+            return found
+        wider = math.sqrt(found.layout.count / _MOST)
+        spacings = (wider * _FINE[0], wider * _FINE[1])
+        return FreeVessel(outer, inner, now, spacings=spacings, expected=known)
 
     def _surfaces(self, x: Float[np.ndarray, " unknowns"]) -> list[Posed]:
         """Returns the surfaces of both walls, with columns for all unknowns."""
-        layout = self.layout
+        at, slopes = self.layout, np.ones(self.layout.inner.stop)
+        inner = x[: at.inner.stop].copy()
+        inner[at.inner], slopes[at.inner] = _limited(inner[at.inner], self._room)
+        followed = self._inner_surface.pose(inner)
+        by_unknowns = scipy.sparse.diags_array(slopes)
         walls = (
-            self._outer_surface.pose(x[layout.outer]),
-            self._inner_surface.pose(x[: layout.inner.stop]),
+            self._outer_surface.pose(x[at.outer]),
+            followed._replace(
+                by_vertices=followed.by_vertices @ by_unknowns,
+                by_normals=followed.by_normals @ by_unknowns,
+            ),
         )
         return [
             wall._replace(
@@ -167,6 +206,15 @@ class FreeVessel(Vessel):
             own, _ = surface.prior(x[where])
             precision[where, where] = scipy.sparse.csr_array(own).toarray()
         return precision, precision @ self._away(x)
+
+    def _away(self, x: Float[np.ndarray, " unknowns"]) -> Float[np.ndarray, " unknowns"]:
+        """Returns how far unknowns are from those that the prior expects."""
+        away, at = super()._away(x), self.layout
+        away[at.glass], away[at.liquid] = (
+            x[at.glass] - self._expected.glass,
+            x[at.liquid] - self._expected.liquid,
+        )
+        return away
 
     def surfaces_cross(self, x: Float[np.ndarray, " unknowns"]) -> bool:
         """Returns whether a vertex of the inner wall is outside the outer one."""
@@ -202,17 +250,19 @@ def fit_free_vessel(
       progress: function called with the share of the work that is done, and a line of text.
 
     Returns:
-      The better of both contents; `None` if no wall leaves space inside, or the walls cross.
+      The best fit whose walls do not cross; `None` if there is none.
     """
     progress(0.0, "distances inside")
+    mesh = with_short_edges(mesh, 2.0 * _FINE[0] * diameter(mesh.vertices))
     distances = distances_inside(mesh)
     some = judges.drawn(np.random.default_rng(seed), _PIXELS)
-    count, done = 2 * len(_FIRST) + len(_OTHERS) + len(_FINEST), 0
+    total, done = 2 * len(_FIRST) * _FIRST_RAYS, 0
+    total += len(_OTHERS) * _RAYS + len(_FINEST) * _FINEST_RAYS
 
     def fitted(vessel: FreeVessel, x: np.ndarray, blurs: tuple[int, ...], rays: int) -> _Fitted:
         nonlocal done
         begin, name = done, vessel.interior_at_start.name
-        done += len(blurs)
+        done += len(blurs) * rays
         fit = gauss_newton.fit(
             vessel,
             x,
@@ -221,7 +271,7 @@ def fit_free_vessel(
             settings=Steps(blurs, rays, _JUDGES, _OUTLIERS, seed=seed, widest=_WIDEST, gain=_GAIN),
             outlines=outlines,
             progress=lambda step, facts: progress(
-                (begin + step) / count, f"{name}: {facts.after:.4f}"
+                (begin + step * rays) / total, f"{name}: {facts.after:.4f}"
             ),
         )
         return _Fitted(vessel, judged(f"free vessel: {name}", vessel, fit, surface, judges))
@@ -235,10 +285,13 @@ def fit_free_vessel(
     found = sorted(found, key=_Fitted.error)[:1]
     if found and found[0].error() < _HOPELESS * rival:
         found.append(fitted(found[0].vessel, found[0].trial.fit.x, _OTHERS, _RAYS))
-        finer = found[-1].vessel.finer(found[-1].trial.fit.x)
-        found.append(fitted(finer, finer.start(), _FINEST, _FINEST_RAYS))
-    possible = (each for each in sorted(found, key=_Fitted.error) if not each.surfaces_cross())
-    return next((each.trial for each in possible), None)
+        best = _best(found)
+        if best is not None:
+            with contextlib.suppress(ReconstructionError):
+                finer = best.vessel.finer(best.trial.fit.x)
+                found.append(fitted(finer, finer.start(), _FINEST, _FINEST_RAYS))
+    best = _best(found)
+    return None if best is None else best.trial
 
 
 class _Fitted(NamedTuple):
@@ -256,6 +309,12 @@ class _Fitted(NamedTuple):
         return self.vessel.surfaces_cross(self.trial.fit.x)
 
 
+def _best(found: Sequence[_Fitted]) -> _Fitted | None:
+    """Returns the vessel of least error whose walls do not cross."""
+    possible = (each for each in sorted(found, key=_Fitted.error) if not each.surfaces_cross())
+    return next(possible, None)
+
+
 def _best_wall(
     mesh: Mesh, at: Interior, distances: Grid, surface: Backdrop, pixels: Photographs
 ) -> FreeVessel | None:
@@ -271,6 +330,14 @@ def _best_wall(
                 error = float(gauss_newton.errors_of(traced, blurred, pixels).mean())
                 found.append((error, len(found), vessel))
     return min(found)[2] if found else None
+
+
+def _limited(
+    offsets: Float[np.ndarray, " n"], room: Float[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Returns offsets that fade before they reach a limit outwards, and their derivatives."""
+    share = np.tanh(np.maximum(offsets, 0.0) / room)
+    return np.where(offsets > 0.0, room * share, offsets), 1.0 - share**2
 
 
 def _widened(matrix: scipy.sparse.csr_array, count: int) -> scipy.sparse.csr_array:

@@ -46,6 +46,7 @@ _CONFIGS |= {
 
 def _few(*names):
     """Every run of the suite tests these, and slow ones the others."""
+    assert set(names) <= set(_CONFIGS)
     marks = {name: () if name in names else pytest.mark.slow for name in _CONFIGS}
     return pytest.mark.parametrize(
         "name", [pytest.param(name, marks=mark) for name, mark in marks.items()]

@@ -2,6 +2,7 @@
 
 import functools
 
+import jax
 import numpy as np
 import pytest
 
@@ -10,7 +11,9 @@ from refref_jax.reconstruct import ReconstructionError, free_vessels, gauss_newt
 from refref_jax.reconstruct.contents import Interior
 from refref_jax.reconstruct.free_vessels import FreeVessel, distances_inside, inner_wall
 from refref_jax.reconstruct.mesh_distance import signed_distance
-from tests.factories import bodies, vessels
+from refref_jax.reconstruct.model_selection import Trial
+from refref_jax.reconstruct.photometry import Photographs
+from tests.factories import bodies, lit_scenes, vessels
 from tests.laws import posed_surfaces
 
 
@@ -82,19 +85,41 @@ def test_a_finer_vessel_is_the_same_with_more_handles(vessel):
         np.testing.assert_allclose(other.mesh.normals, one.mesh.normals, atol=1e-9)
         assert other.index == one.index
         np.testing.assert_allclose(other.tint, one.tint, rtol=1e-12)
-    few, many = (
-        [each.stop - each.start for each in (v.layout.outer, v.layout.inner)]
-        for v in (vessel, finer)
-    )
-    assert many[0] > few[0]
-    assert many[1] > 2 * few[1]
+    counts = [
+        [each.stop - each.start for each in (made.layout.outer, made.layout.inner)]
+        for made in (vessel, finer)
+    ]
+    assert counts[1][0] > counts[0][0] and counts[1][1] > 2 * counts[0][1]
+    # What the prior knew of the glass is not forgotten.
+    x[vessel.layout.glass] += 0.05
+    finer = vessel.finer(x)
+    pulls = [
+        made.prior(at)[1][made.layout.glass] for made, at in ((vessel, x), (finer, finer.start()))
+    ]
+    np.testing.assert_allclose(pulls[1], pulls[0])
+    assert abs(pulls[0]) > 1.0
 
 
-def test_walls_that_cross_are_noticed(vessel):
+def test_a_finer_vessel_has_no_more_unknowns_than_memory_allows(vessel, monkeypatch):
+    many = vessel.finer(vessel.start()).layout.count
+    monkeypatch.setattr(free_vessels, "_MOST", 0.8 * many)
+    assert vessel.finer(vessel.start()).layout.count < many
+
+
+def test_the_inner_wall_does_not_reach_the_outer_one(vessel):
+    x = vessel.start()
+    x[vessel.layout.inner] = 10.0
+    assert not vessel.surfaces_cross(x)
+
+
+def test_walls_that_cross_are_noticed(mesh, vessel, inside):
     x = vessel.start()
     assert not vessel.surfaces_cross(x)
-    x[vessel.layout.inner] = 0.2
-    assert vessel.surfaces_cross(x)
+    crossing = vessel_with(mesh, Interior("air", wall=0.12), inside)
+    crossing._room[:] = 1.0
+    x = crossing.start()
+    x[crossing.layout.inner] = 0.2
+    assert crossing.surfaces_cross(x)
 
 
 @pytest.mark.parametrize(
@@ -109,6 +134,51 @@ def test_walls_that_cross_are_noticed(vessel):
 def test_what_it_cannot_be_is_refused(mesh, inside, interior, message):
     with pytest.raises(ReconstructionError, match=message):
         vessel_with(mesh, interior, inside)
+
+
+@pytest.mark.parametrize(
+    ("errors", "crossing", "best"),
+    [
+        ((0.3, 0.4, 0.2, 0.1), (), 3),
+        ((0.3, 0.4, 0.2, 0.25), (), 2),
+        ((0.3, 0.4, 0.2, 0.1), (3,), 2),
+        ((0.3, 0.4, 0.2, 0.1), (2, 3), 0),
+        ((0.3, 0.4, 0.2, 0.1), (0, 2, 3), None),
+    ],
+)
+def test_the_best_vessel_whose_walls_do_not_cross_is_kept(
+    mesh, vessel, inside, monkeypatch, errors, crossing, best
+):
+    made, shares = [], []
+
+    def fit(model, x, *_, settings, progress, **options):
+        progress(len(settings.blurs), gauss_newton.StepFacts(0, 1.0, 0.5, 0.0, True, 0.0))
+        return gauss_newton.Fit(x, np.eye(len(x)), ())
+
+    def judged(name, model, fit, *_):
+        made.append(Trial(name, model, fit, np.array([errors[len(made)]])))
+        return made[-1]
+
+    monkeypatch.setattr(free_vessels, "distances_inside", lambda mesh: inside)
+    monkeypatch.setattr(free_vessels, "_best_wall", lambda mesh, at, *_: vessel)
+    monkeypatch.setattr(free_vessels, "judged", judged)
+    monkeypatch.setattr(gauss_newton, "fit", fit)
+    monkeypatch.setattr(
+        free_vessels._Fitted, "surfaces_cross", lambda each: errors.index(each.error()) in crossing
+    )
+    rays, views = lit_scenes.pixels(16, reach=0.6)
+    seen = Photographs(jax.device_get(rays), np.zeros((16, 3)), views)
+    found = free_vessels.fit_free_vessel(
+        mesh,
+        vessels.smooth_backdrop(),
+        seen,
+        seen,
+        progress=lambda share, text: shares.append(share),
+    )
+    assert (None if found is None else errors.index(found.error)) == best
+    # Where nothing may be kept, there are no finest steps.
+    assert shares == sorted(shares) and len(made) == (4 if best is not None else 3)
+    assert best is None or shares[-1] == 1.0
 
 
 @pytest.mark.slow

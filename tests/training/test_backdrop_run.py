@@ -137,6 +137,7 @@ def _after_a_round(run):
     return lambda: len(run_folder.read_metrics(run)) == _ROUND
 
 
+@pytest.mark.slow
 def test_a_paused_run_continues_to_the_same_bits(scene, run, tmp_path):
     stop = _after_a_round(tmp_path / "run")
     fit(_config(scene), out=tmp_path / "run", stop=stop, report=lambda line: None)

@@ -333,6 +333,15 @@ def _with_validation(scene, target):
 
 _LIT = dataclasses.replace(_CONFIG, refinement="light")
 
+_JUDGED = (("masks", 0.04), ("sphere", 0.05))
+
+
+def test_where_light_explains_no_more_the_surface_stays_and_the_reason_is_told(scene, whole):
+    mesh = object_source.read_mesh(whole, records.read(whole))
+    masks, worse = (_trial(name, mesh, 1.5, error + _VIEWS) for name, error in _JUDGED)
+    _, chosen, remark = light_stage.choose(scene, mesh, (masks, worse))
+    assert chosen is masks and "no shape explains the judges significantly better" in remark
+
 
 @pytest.mark.parametrize(
     ("after", "kept"), [(0.03, True), pytest.param(0.05, False, marks=pytest.mark.slow)]
@@ -519,7 +528,7 @@ def test_before_a_field_there_is_no_refinement_by_light(scene, whole, tmp_path, 
     monkeypatch.setattr(index_stage, "learn_backdrop", lambda *_, **options: None)
     monkeypatch.setattr(light_stage, "fit", None)  # would raise
     monkeypatch.setattr(geometry_stage, "shape_from_outlines", lambda *_, **options: None)
-    # The surface is made again, now with families of shapes, and tested elsewhere.
+    # The geometry is made again; its refinement is tested elsewhere.
     few = lambda mesh, settings, views: refinement.refine(mesh, _UNREFINED, views=views)
     monkeypatch.setattr(geometry_stage, "refine", few)
     found = _run(scene, out, _LIT, compare=False)
