@@ -2,9 +2,10 @@
 
 The inner wall is a level set of the distance from the outer one, above a flat base. Both are free
 surfaces (`shapes.FreeSurface`). The inner one follows the outer one, so that the wall keeps its
-thickness where light says nothing, and has handles of its own besides, fewer. Their displacements
-fade before they reach the outer wall. In the last steps, handles are half as far apart: at 1/44 of
-the diameter they cannot represent the normals of a figure with limbs to better than 3 degrees.
+thickness where light says nothing, and has handles of its own besides, fewer. Where it would come
+out of the outer one, it stays a little below it. In the last steps, handles are half as far apart:
+at 1/44 of the diameter they cannot represent the normals of a figure with limbs to better than 3
+degrees.
 
 What this cannot represent: the surface of a liquid, and open mouths.
 
@@ -22,16 +23,16 @@ import scipy.sparse
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
-from refref_jax.geometry.triangle_meshes import Mesh, diameter, with_short_edges
+from refref_jax.geometry.triangle_meshes import Mesh, diameter, unit_vectors, with_short_edges
 from refref_jax.reconstruct import ReconstructionError, gauss_newton, photometry
 from refref_jax.reconstruct.contents import GLASS_DEVIATION, Interior, Layout
 from refref_jax.reconstruct.gauss_newton import Candidate, Rows, Steps
 from refref_jax.reconstruct.grids import Box, Grid, find_isosurface, sample
 from refref_jax.reconstruct.interiors import Vessel
-from refref_jax.reconstruct.mesh_distance import signed_distance
+from refref_jax.reconstruct.mesh_distance import ClosestSearch, signed_distance
 from refref_jax.reconstruct.model_selection import Trial, judged
 from refref_jax.reconstruct.photometry import Backdrop, Photographs
-from refref_jax.reconstruct.shapes import FreeSurface, Posed, mesh_of
+from refref_jax.reconstruct.shapes import FreeSurface, Posed, mesh_of, vertex_normals_of
 
 # Distance between the points of the grid of distances, as a share of the diameter.
 _SPACING = 1.0 / 150.0
@@ -42,9 +43,9 @@ _SPACING = 1.0 / 150.0
 _COARSE, _FINE = (1.0 / 44.0, 1.0 / 24.0), (1.0 / 88.0, 1.0 / 44.0)
 _MOST = 6000
 
-# Share of its depth by which the inner wall may come nearer to the outer one, and least depth, as a
-# share of the diameter.
-_OUTWARDS, _THINNEST = 0.75, 1e-4
+# Least depth of the inner wall below the outer one, as a share of the diameter, and distance from a
+# vertex within which depths are exact, as a multiple of it.
+_THINNEST, _NEAR = 0.002, 10.0
 
 # Standard deviations of the inner wall's own handles: minus the mean of their neighbours, and in
 # all, in the units of `FreeSurface`.
@@ -147,8 +148,6 @@ class FreeVessel(Vessel):
         self.layout = Layout(
             interior, weights[0].shape[1], len(self._inner_surface.handles), axis=0
         )
-        depths = -signed_distance(outer)(inner.vertices[self._inner_surface.handles])
-        self._room = _OUTWARDS * np.maximum(depths, _THINNEST * self.size)
         self._inner_surface.weights = scipy.sparse.hstack(weights).tocsr()
 
     def finer(self, x: Float[np.ndarray, " unknowns"]) -> "FreeVessel":
@@ -170,25 +169,16 @@ class FreeVessel(Vessel):
 
     def _surfaces(self, x: Float[np.ndarray, " unknowns"]) -> list[Posed]:
         """Returns the surfaces of both walls, with columns for all unknowns."""
-        at, slopes = self.layout, np.ones(self.layout.inner.stop)
-        inner = x[: at.inner.stop].copy()
-        inner[at.inner], slopes[at.inner] = _limited(inner[at.inner], self._room)
-        followed = self._inner_surface.pose(inner)
-        by_unknowns = scipy.sparse.diags_array(slopes)
-        walls = (
-            self._outer_surface.pose(x[at.outer]),
-            followed._replace(
-                by_vertices=followed.by_vertices @ by_unknowns,
-                by_normals=followed.by_normals @ by_unknowns,
-            ),
-        )
-        return [
+        outer = self._outer_surface.pose(x[self.layout.outer])
+        inner = self._inner_surface.pose(x[: self.layout.inner.stop])
+        outer, inner = (
             wall._replace(
                 by_vertices=_widened(wall.by_vertices, len(x)),
                 by_normals=_widened(wall.by_normals, len(x)),
             )
-            for wall in walls
-        ]
+            for wall in (outer, inner)
+        )
+        return [outer, _kept_below(inner, outer, _THINNEST * self.size)]
 
     def prior(
         self, x: Float[np.ndarray, " unknowns"]
@@ -332,12 +322,30 @@ def _best_wall(
     return min(found)[2] if found else None
 
 
-def _limited(
-    offsets: Float[np.ndarray, " n"], room: Float[np.ndarray, " n"]
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Returns offsets that fade before they reach a limit outwards, and their derivatives."""
-    share = np.tanh(np.maximum(offsets, 0.0) / room)
-    return np.where(offsets > 0.0, room * share, offsets), 1.0 - share**2
+def _kept_below(inner: Posed, outer: Posed, depth: float) -> Posed:
+    """Returns the inner wall, whose vertices follow the outer one where they would be less deep."""
+    normals = vertex_normals_of(outer)
+    nearest = KDTree(outer.vertices).query(inner.vertices)[1]
+    away = inner.vertices - outer.vertices[nearest]
+    height = np.sum(away * normals[nearest], axis=-1)
+    near = np.flatnonzero((height > -depth) | (np.linalg.norm(away, axis=-1) < _NEAR * depth))
+    if not len(near):
+        return inner
+    on = ClosestSearch(outer.vertices, outer.faces)(inner.vertices[near])
+    corners = outer.faces[on.faces]
+    towards = np.sum(on.weights[..., None] * normals[corners], axis=1)
+    away = inner.vertices[near] - on.points
+    side = np.sign(np.sum(away * towards, axis=-1))
+    shallow = side * on.distances > -depth
+    follows, corner = np.zeros(len(inner.vertices)), np.zeros(len(inner.vertices), np.int64)
+    follows[near[shallow]] = 1.0
+    corner[near] = np.take_along_axis(corners, np.argmax(on.weights, axis=1)[:, None], axis=1)[:, 0]
+    vertices, outwards = inner.vertices.copy(), side[:, None] * unit_vectors(away)
+    vertices[near[shallow]] = (on.points - depth * outwards)[shallow]
+    rows, shares = (3 * corner[:, None] + np.arange(3)).ravel(), np.repeat(follows, 3)
+    own = scipy.sparse.diags_array(1.0 - shares) @ inner.by_vertices
+    followed = scipy.sparse.diags_array(shares) @ scipy.sparse.csr_array(outer.by_vertices)[rows]
+    return inner._replace(vertices=vertices, by_vertices=(own + followed).tocsr())
 
 
 def _widened(matrix: scipy.sparse.csr_array, count: int) -> scipy.sparse.csr_array:
