@@ -23,7 +23,13 @@ import scipy.sparse
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
-from refref_jax.geometry.triangle_meshes import Mesh, diameter, unit_vectors, with_short_edges
+from refref_jax.geometry.triangle_meshes import (
+    Mesh,
+    diameter,
+    face_normals,
+    unit_vectors,
+    with_short_edges,
+)
 from refref_jax.reconstruct import ReconstructionError, gauss_newton, photometry
 from refref_jax.reconstruct.contents import GLASS_DEVIATION, Interior, Layout
 from refref_jax.reconstruct.gauss_newton import Candidate, Rows, Steps
@@ -46,6 +52,9 @@ _MOST = 6000
 # Least depth of the inner wall below the outer one, as a share of the diameter, and distance from a
 # vertex within which depths are exact, as a multiple of it.
 _THINNEST, _NEAR = 0.002, 10.0
+
+# Barycentric coordinate below which a point is on the edge of a face.
+_ON_EDGE = 1e-6
 
 # Standard deviations of the inner wall's own handles: minus the mean of their neighbours, and in
 # all, in the units of `FreeSurface`.
@@ -333,7 +342,10 @@ def _kept_below(inner: Posed, outer: Posed, depth: float) -> Posed:
         return inner
     on = ClosestSearch(outer.vertices, outer.faces)(inner.vertices[near])
     corners = outer.faces[on.faces]
-    towards = np.sum(on.weights[..., None] * normals[corners], axis=1)
+    # On edges and corners, the normal of one face may point to the wrong side.
+    inside_face = on.weights.min(axis=1, keepdims=True) > _ON_EDGE
+    between = np.sum(on.weights[..., None] * normals[corners], axis=1)
+    towards = np.where(inside_face, face_normals(outer.vertices[corners]), between)
     away = inner.vertices[near] - on.points
     side = np.sign(np.sum(away * towards, axis=-1))
     shallow = side * on.distances > -depth
