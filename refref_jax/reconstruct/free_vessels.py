@@ -216,9 +216,17 @@ class FreeVessel(Vessel):
         return away
 
     def surfaces_cross(self, x: Float[np.ndarray, " unknowns"]) -> bool:
-        """Returns whether a vertex of the inner wall is outside the outer one."""
+        """Returns whether a vertex of the inner wall is outside the outer one.
+
+        Far from the surface, the sign of its distance may be that of another face, so that a vertex
+        must be above the tangent plane of the nearest vertex, too.
+        """
         outer, inner = self._surfaces(x)
-        return bool(signed_distance(mesh_of(outer))(inner.vertices).max() >= 0.0)
+        outside = signed_distance(mesh_of(outer))(inner.vertices) >= 0.0
+        nearest = KDTree(outer.vertices).query(inner.vertices)[1]
+        away = inner.vertices - outer.vertices[nearest]
+        above = np.sum(away * vertex_normals_of(outer)[nearest], axis=-1) >= 0.0
+        return bool(np.any(outside & above))
 
 
 def fit_free_vessel(
