@@ -218,15 +218,13 @@ class FreeVessel(Vessel):
     def surfaces_cross(self, x: Float[np.ndarray, " unknowns"]) -> bool:
         """Returns whether a vertex of the inner wall is outside the outer one.
 
-        Far from the surface, the sign of its distance may be that of another face, so that a vertex
-        must be above the tangent plane of the nearest vertex, too.
+        Where a face of the outer wall is folded over, signed distances to its corners may have the
+        wrong sign, so that a vertex must be above the tangent plane of the nearest vertex, too.
         """
         outer, inner = self._surfaces(x)
         outside = signed_distance(mesh_of(outer))(inner.vertices) >= 0.0
-        nearest = KDTree(outer.vertices).query(inner.vertices)[1]
-        away = inner.vertices - outer.vertices[nearest]
-        above = np.sum(away * vertex_normals_of(outer)[nearest], axis=-1) >= 0.0
-        return bool(np.any(outside & above))
+        heights, _ = _above_nearest(outer, inner.vertices)
+        return bool(np.any(outside & (heights >= 0.0)))
 
 
 def fit_free_vessel(
@@ -342,10 +340,8 @@ def _best_wall(
 def _kept_below(inner: Posed, outer: Posed, depth: float) -> Posed:
     """Returns the inner wall, whose vertices follow the outer one where they would be less deep."""
     normals = vertex_normals_of(outer)
-    nearest = KDTree(outer.vertices).query(inner.vertices)[1]
-    away = inner.vertices - outer.vertices[nearest]
-    height = np.sum(away * normals[nearest], axis=-1)
-    near = np.flatnonzero((height > -depth) | (np.linalg.norm(away, axis=-1) < _NEAR * depth))
+    heights, distances = _above_nearest(outer, inner.vertices)
+    near = np.flatnonzero((heights > -depth) | (distances < _NEAR * depth))
     if not len(near):
         return inner
     on = ClosestSearch(outer.vertices, outer.faces)(inner.vertices[near])
@@ -366,6 +362,15 @@ def _kept_below(inner: Posed, outer: Posed, depth: float) -> Posed:
     own = scipy.sparse.diags_array(1.0 - shares) @ inner.by_vertices
     followed = scipy.sparse.diags_array(shares) @ scipy.sparse.csr_array(outer.by_vertices)[rows]
     return inner._replace(vertices=vertices, by_vertices=(own + followed).tocsr())
+
+
+def _above_nearest(
+    outer: Posed, points: Float[np.ndarray, "points 3"]
+) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]:
+    """Returns heights above the tangent plane of the nearest vertex, and distances from it."""
+    distances, nearest = KDTree(outer.vertices).query(points)
+    away = points - outer.vertices[nearest]
+    return np.sum(away * vertex_normals_of(outer)[nearest], axis=-1), distances
 
 
 def _widened(matrix: scipy.sparse.csr_array, count: int) -> scipy.sparse.csr_array:
