@@ -1,11 +1,11 @@
 """Vessels of any shape that are full of air or of liquid: two free surfaces, as unknowns of a fit.
 
-The inner wall is a level set of the distance from the outer one, above a flat base. Both are free
-surfaces (`shapes.FreeSurface`). The inner one follows the outer one, so that the wall keeps its
-thickness where light says nothing, and has handles of its own besides, fewer. Where it would come
-out of the outer one, it stays a little below it. In the last steps, handles are half as far apart:
-at 1/44 of the diameter they cannot represent the normals of a figure with limbs to better than 3
-degrees.
+The inner wall is a level set of the distance from the outer one, which may be rounded, above a flat
+base. Both are free surfaces (`shapes.FreeSurface`). The inner one follows the outer one, so that
+the wall keeps its thickness where light says nothing, and has handles of its own besides, fewer.
+Where it would come out of the outer one, it stays a little below it. In the last steps, handles are
+half as far apart: at 1/44 of the diameter they cannot represent the normals of a figure with limbs
+to better than 3 degrees.
 
 What this cannot represent: the surface of a liquid, and open mouths.
 
@@ -14,6 +14,7 @@ Source: ours.
 
 import contextlib
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -21,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.sparse
 from jaxtyping import Float
+from scipy.ndimage import gaussian_filter
 from scipy.spatial import KDTree
 
 from refref_jax.geometry.triangle_meshes import (
@@ -60,9 +62,10 @@ _ON_EDGE = 1e-6
 # all, in the units of `FreeSurface`.
 _ROUGHNESS, _OFFSET = 0.006, 0.04
 
-# Walls and bases that are looked at, as shares of the diameter; number of pixels of a look, and the
-# blur of its backdrop, in halvings.
-_WALLS, _BASES, _PIXELS, _BLUR = (0.008, 0.014, 0.022, 0.035, 0.055), (0.0, 0.045), 3000, 1
+# Walls, bases and widths of the roundings that are looked at, as shares of the diameter; number of
+# pixels of a look, and the blur of its backdrop, in halvings.
+_WALLS, _BASES, _ROUNDINGS = (0.008, 0.014, 0.022, 0.035, 0.055), (0.0, 0.045), (0.0, 0.012, 0.024)
+_PIXELS, _BLUR = 3000, 1
 
 # Blurs of the first steps, which choose the contents, of the others, and of the finest ones; number
 # of pixels of each.
@@ -77,35 +80,44 @@ _OUTLIERS, _WIDEST, _GAIN = 0.02, 0.3, 0.002
 # given up.
 _HOPELESS = 1.25
 
-# Depth inside which distances are exact, in coarse cells of the grid.
-_DEEP = 4.0
+# Margin of the grid around the surface, as a share of the diameter: three widths of a rounding; and
+# distance, in its spacings, beyond which that to the nearest point of many is taken.
+_MARGIN, _FAR = 0.075, 4.0
 
 
-def distances_inside(outer: Mesh) -> Grid:
-    """Returns the distances from a closed surface on a grid, negative inside.
+def distances_to(outer: Mesh) -> Grid:
+    """Returns the distances to a closed surface on a grid, negative inside.
 
-    They are exact to a depth of a tenth of the diameter.
+    They are exact up to four spacings of the grid, and beyond to a twentieth of a spacing.
     """
     size = diameter(outer.vertices)
-    margin = 2.0 * _SPACING * size
+    spacing, margin = _SPACING * size, _MARGIN * size
     box = Box(outer.vertices.min(axis=0) - margin, outer.vertices.max(axis=0) + margin)
-    return sample(signed_distance(outer), box, spacing=_SPACING * size, near=_DEEP)
+    near = sample(signed_distance(outer), box, spacing=spacing)
+    points = near.low + spacing * np.moveaxis(np.indices(near.values.shape), 0, -1)
+    away, _ = KDTree(with_short_edges(outer, spacing).vertices).query(points)
+    values = np.where(away < _FAR * spacing, near.values, np.copysign(away, near.values))
+    return near._replace(values=values)
 
 
-def inner_wall(outer: Mesh, interior: Interior, distances: Grid) -> Mesh:
+def inner_wall(outer: Mesh, interior: Interior, distances: Grid, *, rounding: float = 0.0) -> Mesh:
     """Returns the surface at the depth of the wall inside the outer one, above the base.
 
     Args:
       outer: outer surface.
       interior: thickness of its wall and of its base.
-      distances: distances inside the outer surface.
+      distances: distances to the outer surface.
+      rounding: standard deviation of the Gaussian by which distances are smoothed, world units:
+        glass that was molten has no sharp edges inside.
 
     Raises:
       ReconstructionError: if the wall leaves no space inside.
     """
     floor = float(outer.vertices[:, 2].min()) + interior.base
     heights = distances.low[2] + distances.spacing * np.arange(distances.values.shape[2])
-    space = np.maximum(distances.values + interior.wall, floor - heights)
+    width = rounding / distances.spacing
+    values = gaussian_filter(distances.values, width, mode="nearest") if width else distances.values
+    space = np.maximum(values + interior.wall, floor - heights)
     return find_isosurface(distances._replace(values=space))
 
 
@@ -259,7 +271,7 @@ def fit_free_vessel(
     """
     progress(0.0, "distances inside")
     mesh = with_short_edges(mesh, 2.0 * _FINE[0] * diameter(mesh.vertices))
-    distances = distances_inside(mesh)
+    distances = distances_to(mesh)
     some = judges.drawn(np.random.default_rng(seed), _PIXELS)
     total, done = 2 * len(_FIRST) * _FIRST_RAYS, 0
     total += len(_OTHERS) * _RAYS + len(_FINEST) * _FINEST_RAYS
@@ -325,16 +337,41 @@ def _best_wall(
 ) -> FreeVessel | None:
     """Returns the vessel with the wall and the base that suit it best, if one leaves space."""
     size, blurred = diameter(mesh.vertices), photometry.blurred(surface, _BLUR)
-    found: list[tuple[float, int, FreeVessel]] = []
-    for wall in _WALLS:
-        for base in _BASES:
-            with contextlib.suppress(ReconstructionError):
-                shape = dataclasses.replace(at, wall=wall * size, base=base * size)
-                vessel = FreeVessel(mesh, inner_wall(mesh, shape, distances), shape)
-                traced = gauss_newton.traced_object(vessel.pose(vessel.start()))
-                error = float(gauss_newton.errors_of(traced, blurred, pixels).mean())
-                found.append((error, len(found), vessel))
-    return min(found)[2] if found else None
+    found: list[_Look] = []
+
+    def look(wall: float, base: float, rounding: float) -> None:
+        with contextlib.suppress(ReconstructionError):
+            shape = dataclasses.replace(at, wall=wall * size, base=base * size)
+            inner = inner_wall(mesh, shape, distances, rounding=rounding * size)
+            vessel = FreeVessel(mesh, inner, shape)
+            traced = gauss_newton.traced_object(vessel.pose(vessel.start()))
+            error = float(gauss_newton.errors_of(traced, blurred, pixels).mean())
+            found.append(_Look(error, wall, rounding, vessel))
+
+    for wall, rounding in itertools.product(_WALLS, _ROUNDINGS):
+        look(wall, _BASES[0], rounding)
+    if not found:
+        return None
+    best = min(found, key=lambda each: each.error)
+    for base in _BASES[1:]:
+        look(best.wall, base, best.rounding)
+    return min(found, key=lambda each: each.error).vessel
+
+
+class _Look(NamedTuple):
+    """A vessel that was looked at.
+
+    Attributes:
+      error: error of the pixels.
+      wall: thickness of the wall, as a share of the diameter.
+      rounding: rounding of the inner wall, as a share of the diameter.
+      vessel: the vessel.
+    """
+
+    error: float
+    wall: float
+    rounding: float
+    vessel: FreeVessel
 
 
 def _kept_below(inner: Posed, outer: Posed, depth: float) -> Posed:

@@ -9,7 +9,7 @@ import pytest
 from refref_jax.geometry.triangle_meshes import make_mesh, volume
 from refref_jax.reconstruct import ReconstructionError, free_vessels, gauss_newton, photometry
 from refref_jax.reconstruct.contents import Interior
-from refref_jax.reconstruct.free_vessels import FreeVessel, distances_inside, inner_wall
+from refref_jax.reconstruct.free_vessels import FreeVessel, distances_to, inner_wall
 from refref_jax.reconstruct.mesh_distance import signed_distance
 from refref_jax.reconstruct.model_selection import Trial
 from refref_jax.reconstruct.photometry import Photographs
@@ -31,7 +31,7 @@ def inside(mesh):
     """Distances on a grid that is coarse enough for a test."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(free_vessels, "_SPACING", 3.0 * free_vessels._SPACING)
-        return distances_inside(mesh)
+        return distances_to(mesh)
 
 
 def vessel_with(mesh, interior, inside):
@@ -53,6 +53,17 @@ def test_the_inner_wall_is_at_its_distance_and_above_its_base(mesh, vessel):
     np.testing.assert_allclose(depth[above], 0.12, atol=0.01)
     assert (glass.index, air.index, air.parent) == (1.5, 1.0, 0)
     assert volume(air.mesh.vertices, air.mesh.faces) > 0.0
+
+
+def test_a_rounding_is_the_mean_of_distances_by_a_gaussian(monkeypatch):
+    monkeypatch.setattr(free_vessels, "_SPACING", 1.0 / 50.0)
+    box = bodies.fine_box(1.0, spacing=0.25)
+    distances = distances_to(box)
+    # The mean of the larger of two normal variates is that much above their mean.
+    for rounding, edge in ((0.0, 0.7), (0.12, 0.7 - 0.12 / np.sqrt(np.pi))):
+        inner = inner_wall(box, Interior("air", wall=0.3), distances, rounding=rounding)
+        on = np.array([[0.7, 0.0, 0.0], [0.0, 0.0, -0.7], [edge, edge, 0.0], [0.0, -edge, edge]])
+        np.testing.assert_allclose(signed_distance(inner)(on), 0.0, atol=0.01)
 
 
 @pytest.mark.parametrize("number", [0, 1])
@@ -168,7 +179,7 @@ def test_the_best_vessel_whose_walls_do_not_cross_is_kept(
         made.append(Trial(name, model, fit, np.array([errors[len(made)]])))
         return made[-1]
 
-    monkeypatch.setattr(free_vessels, "distances_inside", lambda mesh: inside)
+    monkeypatch.setattr(free_vessels, "distances_to", lambda mesh: inside)
     monkeypatch.setattr(free_vessels, "_best_wall", lambda mesh, at, *_: vessel)
     monkeypatch.setattr(free_vessels, "judged", judged)
     monkeypatch.setattr(gauss_newton, "fit", fit)
@@ -218,7 +229,7 @@ def test_a_vessel_that_is_far_worse_than_another_shape_gets_no_further_steps(
     small |= {"_JUDGES": 2000}
     for name, value in small.items():
         monkeypatch.setattr(free_vessels, name, value)
-    monkeypatch.setattr(free_vessels, "distances_inside", lambda mesh: inside)
+    monkeypatch.setattr(free_vessels, "distances_to", lambda mesh: inside)
     surface = vessels.smooth_backdrop()
     truth = vessel_with(mesh, Interior("air", wall=0.12, stained=True), inside)
     seen = vessels.photographs(truth, surface, reach=0.7)
