@@ -17,6 +17,8 @@ from refref_jax.reconstruct import gauss_newton, photometry
 from tests.factories import bodies, vessels
 from tests.processes.command import run_command
 
+pytestmark = pytest.mark.computing
+
 _SIZE, _FOCAL = 48, 60.0
 
 
