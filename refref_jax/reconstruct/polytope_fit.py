@@ -131,13 +131,10 @@ def along_edges(corners: Polygon, *, margin: float) -> Samples:
 def look_up(image: Image, pixels: Pixels) -> tuple[Values, Pixels]:
     """Returns an image's values interpolated between pixel centres, and their slopes per pixel."""
     column, row = pixels.T - 0.5
-
-    def value(down: float, right: float) -> Values:
-        return map_coordinates(image, [row + down, column + right], order=1, mode="nearest")
-
-    across = value(0.0, 0.5) - value(0.0, -0.5)
-    along = value(0.5, 0.0) - value(-0.5, 0.0)
-    return value(0.0, 0.0), np.stack([across, along], axis=-1)
+    down = np.array([0.0, 0.0, 0.0, 0.5, -0.5])[:, None]
+    right = np.array([0.0, 0.5, -0.5, 0.0, 0.0])[:, None]
+    values = map_coordinates(image, [row + down, column + right], order=1, mode="nearest")
+    return values[0], np.stack([values[1] - values[2], values[3] - values[4]], axis=-1)
 
 
 def outline_overlaps(corners: Corners, views: Views) -> Float[np.ndarray, " views"]:
