@@ -98,8 +98,15 @@ def test_a_known_size_is_measured_from_float_depth(kind, size, known_masks):
 
 
 @pytest.mark.parametrize(("kind", "size"), [("cube", 7.3), ("cube", 8.9), ("sphere", 7.3)])
-@pytest.mark.parametrize("known_masks", [True, False])
-@pytest.mark.parametrize("jitter", [0.0, 1.0])
+@pytest.mark.parametrize(
+    ("known_masks", "jitter"),
+    [
+        (True, 1.0),
+        (False, 0.0),
+        pytest.param(True, 0.0, marks=pytest.mark.slow),
+        pytest.param(False, 1.0, marks=pytest.mark.slow),
+    ],
+)
 def test_8_bit_depth_gives_the_size_within_its_error(kind, size, known_masks, jitter):
     seen = _views(20)
     depths, masks = _render(kind, size, seen, jitter=jitter)
@@ -148,8 +155,15 @@ def _seen_around(kind, size, centre, *, moved):
 
 
 @pytest.mark.parametrize("kind", ["cube", "sphere"])
-@pytest.mark.parametrize("eight_bit", [True, False], ids=["8 bit", "float"])
-@pytest.mark.parametrize("known_masks", [True, False])
+@pytest.mark.parametrize(
+    ("eight_bit", "known_masks"),
+    [
+        pytest.param(True, False, id="8 bit"),
+        pytest.param(False, True, id="float, masks"),
+        pytest.param(True, True, marks=pytest.mark.slow, id="8 bit, masks"),
+        pytest.param(False, False, marks=pytest.mark.slow, id="float"),
+    ],
+)
 @pytest.mark.parametrize(
     ("centre", "moved"),
     [

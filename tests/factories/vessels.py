@@ -1,5 +1,7 @@
 """A bottle in front of a smooth backdrop, and pixels of it."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +16,7 @@ from tests.factories import lit_scenes, revolved
 _mipmap = jax.jit(backdrop.mipmap, static_argnames="space")
 
 
+@functools.cache
 def bottle():
     """A bottle, 2.6 high."""
     knee = revolved.arc((0.75, -1.15), 0.15, -90, 0)

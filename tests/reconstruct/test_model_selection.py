@@ -115,7 +115,7 @@ def test_a_handle_is_no_noise():
 
 
 def test_several_pieces_are_no_family():
-    views = _views_from_above(_ball, pixels=0.0)
+    views = _views_from_above(_ball, pixels=0.0, size=64)
     two = bodies.joined(bodies.icosphere(), bodies.icosphere(radius=0.2, centre=(1.4, 0.0, 0.0)))
     assert model_selection.shape_from_outlines(two, views) is None
 
@@ -127,7 +127,7 @@ def test_full_masks_have_no_outline():
 
 
 def test_one_view_cannot_judge():
-    views = _views_from_above(_ball, pixels=0.5)
+    views = _views_from_above(_ball, pixels=0.5, size=64)
     one = views_at(views, np.array([0]))
     assert model_selection.shape_from_outlines(bodies.icosphere(), one) is None
 

@@ -58,6 +58,11 @@ def relief(foot):
     return measure_relief(foot, _UPRIGHT)
 
 
+@pytest.fixture(scope="module")
+def outer(foot, relief):
+    return fit_revolution(foot, furthest=0.05).with_relief(relief)
+
+
 def test_the_relief_of_a_foot_with_six_sides_is_measured(foot, relief):
     heights = relief.low + relief.step * np.arange(len(relief.factors))
     azimuth = 2.0 * np.pi * np.arange(relief.factors.shape[1]) / relief.factors.shape[1]
@@ -117,8 +122,7 @@ def test_points_on_the_axis_and_beyond_both_ends_stay_finite(relief):
     np.testing.assert_array_equal(found.points[:2], points[:2])
 
 
-def test_normals_are_perpendicular_to_the_stretched_surface(foot, relief):
-    outer = fit_revolution(foot, furthest=0.05).with_relief(relief)
+def test_normals_are_perpendicular_to_the_stretched_surface(outer):
     posed = outer.pose(outer.start())
     corners = posed.vertices[posed.faces]
     flat = face_normals(corners)
@@ -129,8 +133,7 @@ def test_normals_are_perpendicular_to_the_stretched_surface(foot, relief):
     assert np.median(angle) < 0.8 and np.quantile(angle, 0.99) < 3.5
 
 
-def test_vertices_move_as_their_derivatives_say(foot, relief):
-    outer = fit_revolution(foot, furthest=0.05).with_relief(relief)
+def test_vertices_move_as_their_derivatives_say(outer):
     generator, x = np.random.default_rng(1), outer.start()
     step = 1e-6 * generator.normal(size=len(x))
     after, before, now = outer.pose(x + step), outer.pose(x - step), outer.pose(x)
