@@ -12,8 +12,8 @@ def _read(scene, files):
     return facts._replace(misfits=facts.misfits and functools.cache(facts.misfits))
 
 
-@pytest.fixture(autouse=True)
-def _unchanged_scenes_are_read_once(monkeypatch):
+@pytest.fixture(autouse=True, scope="module")
+def _unchanged_scenes_are_read_once():
     """To read and check the bundled scene takes a second, and most tests prepare a run on it."""
 
     def read_facts(scene, *, parts=None):
@@ -23,4 +23,6 @@ def _unchanged_scenes_are_read_once(monkeypatch):
         stats = [path.stat() for path in found]
         return _read(scene, tuple((x.st_ino, x.st_size, x.st_mtime_ns) for x in stats))
 
-    monkeypatch.setattr(fit, "read_facts", read_facts)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fit, "read_facts", read_facts)
+        yield

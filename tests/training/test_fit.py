@@ -2,7 +2,6 @@
 
 import ast
 import json
-import re
 import shutil
 
 import imageio.v3 as iio
@@ -16,45 +15,28 @@ from refref_jax.render import checkpoint_io
 from refref_jax.render.images import render_image
 from refref_jax.training import fit, run_folder
 from refref_jax.training.config import TrainConfig
-from tests.factories import small_scenes
+from tests.factories import readme_script, small_scenes
 from tests.factories.cut_ball import cut_ball
 from tests.processes.command import ROOT
 
 pytestmark = [pytest.mark.loose, pytest.mark.longest]
 
 
-def _script():
-    snippets = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
-    (script,) = (each for each in snippets if "refref_jax.fit(" in each)
-    return script
+_SMALL = (
+    "steps=4, paths='paper', max_res=32, batch=64, pretraced_batches=4, "
+    "samples_per_ray=(8, 6), log2_hashmap_size=10"
+)
 
 
-def _execute(script, folder):
-    """Returns the folder of the run that the README's script leaves."""
-    (folder / "experiments").symlink_to(ROOT / "experiments")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        exec(compile(script, "README.md", "exec"), {})
-    return folder / "runs" / "fifty"
-
-
-_SMALL = {
-    "splats": "field='splats', gaussians=200",
-    "field": "paths='paper', max_res=32, batch=64, pretraced_batches=4, "
-    "samples_per_ray=(8, 6), log2_hashmap_size=10",
-}
-
-
-# Splats compile in a third of the time; what else is quick trains a field by commands.
-@pytest.fixture(scope="module", params=["splats", pytest.param("field", marks=pytest.mark.slow)])
-def four(request, tmp_path_factory):
+@pytest.fixture(scope="module")
+def four(tmp_path_factory):
     """The folder of the README's script, after it has run with four steps and small sizes."""
-    script = _script().replace("steps=50", f"steps=4, {_SMALL[request.param]}")
-    return _execute(script.replace("size=128", "size=16"), tmp_path_factory.mktemp("script"))
+    script = readme_script.small(_SMALL)
+    return readme_script.execute(script, tmp_path_factory.mktemp("script"))
 
 
 def test_the_script_of_the_readme_is_short_and_imports_the_library_alone():
-    script = _script()
+    script = readme_script.read()
     assert len(script.strip().splitlines()) <= 12 and "steps=50" in script
     for node in ast.walk(ast.parse(script)):
         if isinstance(node, ast.Import):
@@ -63,6 +45,8 @@ def test_the_script_of_the_readme_is_short_and_imports_the_library_alone():
             assert node.module.split(".")[0] == "refref_jax"
 
 
+# `test_splats_run` has the same of splats, which compile in a third of the time.
+@pytest.mark.slow
 def test_the_script_of_the_readme_trains_and_renders_small_images(four):
     assert run_folder.read_metrics(four)[-1]["step"] == 4
     view = iio.imread(four / "view.png", plugin="pillow")
@@ -71,13 +55,14 @@ def test_the_script_of_the_readme_trains_and_renders_small_images(four):
 
 @pytest.mark.slow
 def test_the_script_of_the_readme_trains_and_renders(tmp_path):
-    fifty = _execute(_script(), tmp_path)
+    fifty = readme_script.execute(readme_script.read(), tmp_path)
     lines = run_folder.read_metrics(fifty)
     assert lines[-1]["step"] == 50 and lines[-1]["psnr"] > 12.0
     view = iio.imread(fifty / "view.png", plugin="pillow")
     assert view.shape == (128, 128, 3) and view.std() > 10.0
 
 
+@pytest.mark.slow
 def test_the_configuration_of_a_run_repeats_it_bit_for_bit(four, tmp_path):
     config = run_folder.read_config(four)
     messages = []
@@ -97,6 +82,7 @@ def test_the_configuration_of_a_run_repeats_it_bit_for_bit(four, tmp_path):
         fit.fit(config, out=tmp_path / "again")
 
 
+@pytest.mark.slow
 def test_a_model_is_loaded_without_a_word_and_nothing_is_written(four, caplog, capfd):
     before = {path: path.stat().st_mtime_ns for path in four.rglob("*")}
     checkpoint_io.load_model(four)

@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 
+import imageio.v3 as iio
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +19,7 @@ from refref_jax.render.model import look_up
 from refref_jax.splats.gaussians import Gaussians, read_ply
 from refref_jax.training import fit, presets, run_folder
 from refref_jax.training.config import TrainConfig
+from tests.factories import readme_script
 from tests.factories.small_model import CAMERAS
 from tests.laws import expectations
 from tests.processes.command import ROOT, run_command
@@ -38,11 +40,50 @@ def _quiet(line):
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    """A model, and the folder of its run."""
+def script(tmp_path_factory):
+    """The folder of the README's script, after it has trained splats."""
+    few = readme_script.small("field='splats', gaussians=500, steps=20")
+    return readme_script.execute(few, tmp_path_factory.mktemp("script"))
+
+
+@pytest.fixture(scope="module")
+def trained(script, tmp_path_factory):
+    """The model that the configuration of the script's run repeats, and the folder of its run."""
     run = tmp_path_factory.mktemp("splats") / "run"
-    made = fit.fit(_config(), out=run, periods=_PERIODS, report=_quiet)
+    made = fit.fit(run_folder.read_config(script), out=run, periods=_PERIODS, report=_quiet)
     return made, run
+
+
+def test_the_script_of_the_readme_trains_splats_and_renders_them(script):
+    assert run_folder.read_metrics(script)[-1]["step"] == 20
+    view = iio.imread(script / "view.png", plugin="pillow")
+    assert view.shape == (16, 16, 3) and view.std() > 0.0
+
+
+def test_the_configuration_of_a_run_repeats_it_bit_for_bit(script, trained):
+    made, run = trained
+    config = run_folder.read_config(script)
+    assert run_folder.read_config(run) == config
+    first = checkpoint_io.load_model(script)
+    assert (first.config, first.settings) == (made.config, made.settings)
+    expectations.assert_same(first.params, made.params)
+    # Resumed, it is done; with another option it is refused.
+    messages = []
+    done = fit.fit(config, out=run, existing="resume", report=messages.append)
+    assert any("given: scene=" in message for message in messages)
+    assert "trained already" in messages[-1] and done.settings == made.settings
+    with pytest.raises(ValueError, match=r"other options \(seed\)"):
+        fit.fit(config.override(seed=3), out=run, existing="resume", report=_quiet)
+    with pytest.raises(ValueError, match="contains a run already"):
+        fit.fit(config, out=run, report=_quiet)
+
+
+def test_a_model_is_loaded_without_a_word_and_nothing_is_written(script, caplog, capfd):
+    before = {path: path.stat().st_mtime_ns for path in script.rglob("*")}
+    checkpoint_io.load_model(script)
+    assert checkpoint_io.latest_step(script) == 20
+    assert not caplog.records and capfd.readouterr() == ("", "")
+    assert before == {path: path.stat().st_mtime_ns for path in script.rglob("*")}
 
 
 def test_a_run_has_metrics_and_a_complete_configuration(trained):
