@@ -204,7 +204,9 @@ def test_points_directions_and_distances_agree():
     np.testing.assert_allclose(np.linalg.norm(paths.directions, axis=-1), 1.0, atol=1e-6)
 
 
-@pytest.mark.parametrize("bends", [pytest.param(1, marks=pytest.mark.slow), 3])
+# At each run, the slab of `test_path_tree` has such paths.
+@pytest.mark.slow
+@pytest.mark.parametrize("bends", [1, 3])
 def test_a_path_out_of_bends_says_so_and_goes_on(bends):
     rays = scenes.rays([-4.0, 0.1, 0.0], [1.0, 0.0, 0.0])
     full = _refracted(_ball_in_ball("nested"), rays)
