@@ -16,7 +16,10 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 
 # Options of a training that takes seconds.
-TINY = ("--steps=6", "--batch=64", "--log_every=3", "--checkpoint_every=3")
+TINY = (
+    *("--steps=6", "--batch=64", "--log_every=3", "--checkpoint_every=3"),
+    *("--pretraced_batches=4", "--samples_per_ray=8,6", "--max_res=32", "--log2_hashmap_size=10"),
+)
 
 _forks = multiprocessing.get_context("forkserver")
 _forks.set_forkserver_preload(
