@@ -278,21 +278,17 @@ def _solid_angles(
     # Coordinates are the leading axis, so that every product below is over whole arrays.
     a, b, c = (corners[:, i].T[:, None] - points.T[:, :, None] for i in range(3))
     la, lb, lc = (np.sqrt(_dot(edge, edge)) for edge in (a, b, c))
-    triple = _dot(a, np.stack([_minor(b, c, 1, 2), _minor(b, c, 2, 0), _minor(b, c, 0, 1)]))
+    # The volume that the corners span is that of one of them and two edges, whatever the point.
+    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    triple = _dot(a, np.cross(first, second).T[:, None])
     dots = la * lb * lc + _dot(a, b) * lc + _dot(b, c) * la + _dot(c, a) * lb
     return 2.0 * np.arctan2(triple, dots)
 
 
 def _dot(
-    a: Float[np.ndarray, "3 points faces"], b: Float[np.ndarray, "3 points faces"]
+    a: Float[np.ndarray, "3 points faces"], b: Float[np.ndarray, "3 #points faces"]
 ) -> Float[np.ndarray, "points faces"]:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _minor(
-    a: Float[np.ndarray, "3 points faces"], b: Float[np.ndarray, "3 points faces"], i: int, j: int
-) -> Float[np.ndarray, "points faces"]:
-    return a[i] * b[j] - a[j] * b[i]
 
 
 def is_convex(part: MeshPart) -> bool:
