@@ -5,7 +5,7 @@ import shutil
 import tempfile
 from pathlib import Path
 
-from tests.processes import code_generator
+from tests.processes import bytecode, code_generator
 
 # Several processes share an accelerator.
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
@@ -22,6 +22,8 @@ os.environ.update(code_generator.faster())
 
 import jax
 import pytest
+
+bytecode.find_that_of_others()
 
 # Traced programs are millions of objects: to look for garbage among them took a tenth of the time.
 gc.set_threshold(100_000, 10, 10)
