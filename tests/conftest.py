@@ -23,7 +23,7 @@ os.environ.update(code_generator.faster())
 import jax
 import pytest
 
-bytecode.find_that_of_others()
+bytecode.reuse_that_of_other_packages()
 
 # Traced programs are millions of objects: to look for garbage among them took a tenth of the time.
 gc.set_threshold(100_000, 10, 10)

@@ -45,8 +45,8 @@ _PROBED_PAIRS = 1 << 21
 # closer than that touch.
 _GAP = 1e-5
 
-# Number of triangles times points of one sum of solid angles, whose arrays fit into a core's cache:
-# sums of a million took nearly three times as long.
+# Number of triangles times points of one sum of solid angles, few enough for a core's cache: sums
+# of a million took nearly three times as long.
 _SWEEP = 1 << 14
 
 TOLERANCE = 1e-5
@@ -278,7 +278,7 @@ def _solid_angles(
     # Coordinates are the leading axis, so that every product below is over whole arrays.
     a, b, c = (corners[:, i].T[:, None] - points.T[:, :, None] for i in range(3))
     la, lb, lc = (np.sqrt(_dot(edge, edge)) for edge in (a, b, c))
-    # The volume that the corners span is that of one of them and two edges, whatever the point.
+    # `a . (b x c)` is `a . ((b - a) x (c - a))`, whose product of edges is the same for all points.
     first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     triple = _dot(a, np.cross(first, second).T[:, None])
     dots = la * lb * lc + _dot(a, b) * lc + _dot(b, c) * la + _dot(c, a) * lb

@@ -100,6 +100,9 @@ class ClosestSearch:
         if len(kept) == 0:
             raise ReconstructionError("All triangles of the mesh are degenerate. Rebuild the mesh.")
         self._corners = vertices[faces]
+        # Distances are computed in units near the diameter: trimesh's tolerances are absolute. A
+        # power of two changes no digit.
+        self._unit = np.exp2(np.round(np.log2(diameter(vertices))))
         self._pieces, owner = _cut(vertices[faces[kept]], _LONGEST_EDGE * diameter(vertices))
         self._owner = kept[owner]
         middles = self._pieces.mean(axis=1)
@@ -137,7 +140,8 @@ class ClosestSearch:
         may_be = away - self._radii[near] <= away[:, :1]  # no triangle is further than its centre
         row, _ = np.nonzero(may_be)
         on = np.full((*near.shape, 3), np.inf)
-        on[may_be] = closest_point(self._pieces[near[may_be]], points[row])
+        pieces = self._pieces[near[may_be]] / self._unit
+        on[may_be] = self._unit * closest_point(pieces, points[row] / self._unit)
         distance = np.linalg.norm(on - points[:, None], axis=-1)
         best = np.argmin(distance, axis=1)
         row = np.arange(len(points))

@@ -12,6 +12,7 @@ from refref_jax.reconstruct.masks import Views, carve
 from refref_jax.reconstruct.mesh_distance import (
     carved_alone,
     compare_meshes,
+    signed_distance,
     silhouette_overlap,
     silhouettes,
     without_outliers,
@@ -31,6 +32,14 @@ def test_concentric_balls_are_as_far_as_their_radii():
     diameter = 2.0 * np.sqrt(3.0)
     assert found.chamfer == pytest.approx(0.1 / diameter, rel=0.02)
     assert found.normal_error < 0.3
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1e4])
+def test_distances_scale_with_the_mesh(scale):
+    ball, points = bodies.icosphere(2), np.random.default_rng(0).normal(size=(200, 3))
+    small = make_mesh(scale * ball.vertices, ball.faces)
+    expected = scale * signed_distance(ball)(points)
+    np.testing.assert_allclose(signed_distance(small)(scale * points), expected, rtol=1e-6)
 
 
 def test_turned_normals_are_off_by_the_angle():

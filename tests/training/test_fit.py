@@ -45,7 +45,7 @@ def test_the_script_of_the_readme_is_short_and_imports_the_library_alone():
             assert node.module.split(".")[0] == "refref_jax"
 
 
-# `test_splats_run` has the same of splats, which compile in a third of the time.
+# `test_splats_run` runs the same tests on splats, which compile in a third of the time.
 @pytest.mark.slow
 def test_the_script_of_the_readme_trains_and_renders_small_images(four):
     assert run_folder.read_metrics(four)[-1]["step"] == 4
