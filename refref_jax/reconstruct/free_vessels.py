@@ -73,7 +73,7 @@ _LIQUIDS = (1.36, 1.45)
 
 # Blurs of the first steps, which choose the contents, of the others, and of the finest ones; number
 # of pixels of each.
-_FIRST, _OTHERS, _FINEST = (2, 2, 1), (1, *[0] * 15), (0,) * 12
+_FIRST, _OTHERS, _FINEST = (2, 2, 1), (1, *[0] * 15), (0,) * 24
 _FIRST_RAYS, _RAYS, _FINEST_RAYS, _JUDGES = 12_000, 24_000, 48_000, 8192
 
 # Share of the pixels of largest derivatives that a step leaves out, least scale of the robust
