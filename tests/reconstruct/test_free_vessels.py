@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from refref_jax.geometry.triangle_meshes import make_mesh, volume
+from refref_jax.geometry.triangle_meshes import diameter, make_mesh, volume
 from refref_jax.reconstruct import ReconstructionError, free_vessels, gauss_newton, photometry
 from refref_jax.reconstruct.contents import Interior
 from refref_jax.reconstruct.free_vessels import FreeVessel, distances_to, inner_wall
@@ -71,6 +71,17 @@ def test_a_rounded_edge_is_where_a_gaussian_puts_it(monkeypatch):
         np.testing.assert_allclose(signed_distance(inner)(on), 0.0, atol=0.01)
 
 
+def test_a_rounding_thickens_a_curved_wall(monkeypatch):
+    monkeypatch.setattr(free_vessels, "_SPACING", 1.0 / 60.0)
+    ball = bodies.icosphere(4)
+    rounding = free_vessels._ROUNDINGS[-1] * diameter(ball.vertices)
+    interior = Interior("air", wall=0.02)
+    inner = inner_wall(ball, interior, distances_to(ball), rounding=rounding)
+    # The mean of a distance by a Gaussian is larger by half its Laplacian times the variance.
+    radii = np.linalg.norm(inner.vertices, axis=-1)
+    np.testing.assert_allclose(radii + rounding**2 / radii, 0.98, atol=0.003)
+
+
 def test_distances_are_those_to_the_mesh_near_and_far(mesh, inside):
     points = np.random.default_rng(0).integers(0, inside.values.shape, (400, 3))
     found = inside.values[tuple(points.T)] / inside.spacing
@@ -91,7 +102,7 @@ def test_what_is_no_rounding_is_refused(mesh, inside, rounding):
 def test_the_wall_the_rounding_and_then_the_base_that_suit_best_are_taken(
     mesh, inside, monkeypatch, fits
 ):
-    size = np.linalg.norm(np.ptp(mesh.vertices, axis=0))
+    size = diameter(mesh.vertices)
     best = np.array([free_vessels._WALLS[2], free_vessels._BASES[1], free_vessels._ROUNDINGS[1]])
 
     def wall(outer, interior, distances, *, rounding):
