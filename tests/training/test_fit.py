@@ -17,6 +17,7 @@ from refref_jax.training import fit, run_folder
 from refref_jax.training.config import TrainConfig
 from tests.factories import readme_script, small_scenes
 from tests.factories.cut_ball import cut_ball
+from tests.laws import runs
 from tests.processes.command import ROOT
 
 pytestmark = [pytest.mark.loose, pytest.mark.longest]
@@ -64,31 +65,16 @@ def test_the_script_of_the_readme_trains_and_renders(tmp_path):
 
 @pytest.mark.slow
 def test_the_configuration_of_a_run_repeats_it_bit_for_bit(four, tmp_path):
-    config = run_folder.read_config(four)
     messages = []
-    model = fit.fit(config, out=tmp_path / "again", report=messages.append)
-    assert run_folder.read_config(tmp_path / "again") == config
-    first = checkpoint_io.load_model(four)
-    assert (first.config, first.settings) == (model.config, model.settings)
-    pairs = zip(jax.tree.leaves(first.params), jax.tree.leaves(model.params), strict=True)
-    assert all(np.array_equal(ours, again) for ours, again in pairs)
+    config, again = run_folder.read_config(four), tmp_path / "again"
+    model = fit.fit(config, out=again, report=messages.append)
     assert any("given: scene=" in message for message in messages)
-    # Resumed, it is done; with another option it is refused.
-    done = fit.fit(config, out=tmp_path / "again", existing="resume", report=messages.append)
-    assert "trained already" in messages[-1] and done.settings == model.settings
-    with pytest.raises(ValueError, match=r"other options \(seed\)"):
-        fit.fit(config.override(seed=3), out=tmp_path / "again", existing="resume")
-    with pytest.raises(ValueError, match="contains a run already"):
-        fit.fit(config, out=tmp_path / "again")
+    runs.assert_repeats(four, model, again)
 
 
 @pytest.mark.slow
 def test_a_model_is_loaded_without_a_word_and_nothing_is_written(four, caplog, capfd):
-    before = {path: path.stat().st_mtime_ns for path in four.rglob("*")}
-    checkpoint_io.load_model(four)
-    assert checkpoint_io.latest_step(four) == 4
-    assert not caplog.records and capfd.readouterr() == ("", "")
-    assert before == {path: path.stat().st_mtime_ns for path in four.rglob("*")}
+    runs.assert_loads_quietly(four, 4, caplog, capfd)
 
 
 def test_what_is_asked_for_stays_where_the_path_of_the_scene_is_made_absolute(

@@ -21,7 +21,7 @@ from refref_jax.training import fit, presets, run_folder
 from refref_jax.training.config import TrainConfig
 from tests.factories import readme_script
 from tests.factories.small_model import CAMERAS
-from tests.laws import expectations
+from tests.laws import expectations, runs
 from tests.processes.command import ROOT, run_command
 
 pytestmark = [pytest.mark.loose, pytest.mark.longest]
@@ -61,29 +61,11 @@ def test_the_script_of_the_readme_trains_splats_and_renders_them(script):
 
 
 def test_the_configuration_of_a_run_repeats_it_bit_for_bit(script, trained):
-    made, run = trained
-    config = run_folder.read_config(script)
-    assert run_folder.read_config(run) == config
-    first = checkpoint_io.load_model(script)
-    assert (first.config, first.settings) == (made.config, made.settings)
-    expectations.assert_same(first.params, made.params)
-    # Resumed, it is done; with another option it is refused.
-    messages = []
-    done = fit.fit(config, out=run, existing="resume", report=messages.append)
-    assert any("given: scene=" in message for message in messages)
-    assert "trained already" in messages[-1] and done.settings == made.settings
-    with pytest.raises(ValueError, match=r"other options \(seed\)"):
-        fit.fit(config.override(seed=3), out=run, existing="resume", report=_quiet)
-    with pytest.raises(ValueError, match="contains a run already"):
-        fit.fit(config, out=run, report=_quiet)
+    runs.assert_repeats(script, *trained)
 
 
 def test_a_model_is_loaded_without_a_word_and_nothing_is_written(script, caplog, capfd):
-    before = {path: path.stat().st_mtime_ns for path in script.rglob("*")}
-    checkpoint_io.load_model(script)
-    assert checkpoint_io.latest_step(script) == 20
-    assert not caplog.records and capfd.readouterr() == ("", "")
-    assert before == {path: path.stat().st_mtime_ns for path in script.rglob("*")}
+    runs.assert_loads_quietly(script, 20, caplog, capfd)
 
 
 def test_a_run_has_metrics_and_a_complete_configuration(trained):
