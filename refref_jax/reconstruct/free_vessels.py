@@ -118,8 +118,8 @@ def inner_wall(outer: Mesh, interior: Interior, distances: Grid, *, rounding: fl
       interior: thickness of its wall and of its base.
       distances: distances to the outer surface.
       rounding: standard deviation of the Gaussian by which distances are smoothed, world units: the
-        inner surface of blown glass is smooth. Values near the border of the grid are repeated
-        beyond it, so at most a third of the margin of `distances_to`.
+        inner surface of blown glass is smooth. It should not exceed 0.025 of the diameter, since
+        the grid of `distances_to` ends three times as far from the surface.
 
     Raises:
       ValueError: if the rounding is negative or not finite.
@@ -323,8 +323,8 @@ def fit_free_vessel(
             found.append(fitted(vessel, vessel.start(), _FIRST, _FIRST_RAYS))
     errors = [each.error() for each in found]
     if errors and min(errors) < _HOPELESS * rival:
-        going_on = [each for each in found if each.error() <= _WORSE * min(errors)]
-        found += [fitted(each.vessel, each.trial.fit.x, _OTHERS, _RAYS) for each in going_on]
+        close = [each for each in found if each.error() <= _WORSE * min(errors)]
+        found += [fitted(each.vessel, each.trial.fit.x, _OTHERS, _RAYS) for each in close]
         best, done = _best(found), total - finest
         if best is not None:
             with contextlib.suppress(ReconstructionError):
@@ -388,7 +388,7 @@ class _Look(NamedTuple):
       error: error of the pixels.
       wall: thickness of the wall, as a share of the diameter.
       rounding: rounding of the inner wall, as a share of the diameter.
-      vessel: the vessel.
+      vessel: vessel with this wall.
     """
 
     error: float

@@ -238,7 +238,7 @@ def test_what_it_cannot_be_is_refused(mesh, inside, interior, message):
         ((0.3, 0.4, 0.5, 0.2, 0.1), (3, 4), 0),
         ((0.3, 0.4, 0.5, 0.2, 0.1), (0, 3, 4), 1),
         ((0.3, 0.4, 0.5, 0.2, 0.1), (0, 1, 2, 3, 4), None),
-        # Contents that are hardly worse at first go on, too.
+        # Contents that are hardly worse at first get further steps, too.
         ((0.3, 0.32, 0.4, 0.2, 0.18, 0.1), (), 5),
         ((0.3, 0.32, 0.4, 0.2, 0.18, 0.19), (), 4),
         ((0.32, 0.4, 0.3, 0.2, 0.18, 0.1), (4, 5), 3),
