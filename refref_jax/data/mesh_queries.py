@@ -19,7 +19,13 @@ from scipy.spatial import ConvexHull, KDTree, QhullError, cKDTree
 
 from refref_jax.data import SceneError
 from refref_jax.data.meshes import MeshPart
-from refref_jax.geometry.triangle_meshes import face_normals, is_degenerate, is_watertight, volume
+from refref_jax.geometry.triangle_meshes import (
+    Mesh,
+    face_normals,
+    is_degenerate,
+    is_watertight,
+    volume,
+)
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.optics.media import EMPTY_SLOT, SLOTS
 
@@ -232,7 +238,7 @@ def parts_around(
 
 
 def winding_number(
-    part: MeshPart, points: Float[np.ndarray, "points 3"]
+    surface: Mesh | MeshPart, points: Float[np.ndarray, "points 3"]
 ) -> Float[np.ndarray, " points"]:
     """Returns the winding number of a surface around points: 1 inside, 0 outside a closed surface.
 
@@ -242,9 +248,9 @@ def winding_number(
     Source: Jacobson et al., Robust Inside-Outside Segmentation using Generalized Winding
     Numbers (2013); van Oosterom and Strackee (1983) for the solid angle.
     """
-    low, high = part.vertices.min(axis=0), part.vertices.max(axis=0)
+    low, high = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
     near = np.all((points >= low) & (points <= high), axis=1)
-    corners = part.vertices[part.faces]
+    corners = surface.vertices[surface.faces]
     total = np.zeros(len(points))
     step = max(1, _SWEEP // max(1, near.sum()))
     for start in range(0, len(corners) if near.any() else 0, step):

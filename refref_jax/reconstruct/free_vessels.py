@@ -26,6 +26,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial import KDTree
 
 from refref_jax.compilation import threads
+from refref_jax.data.mesh_queries import winding_number
 from refref_jax.geometry.triangle_meshes import (
     Mesh,
     diameter,
@@ -55,6 +56,10 @@ _MOST = 6000
 # Least depth of the inner wall below the outer one, as a share of the diameter, and distance from a
 # vertex within which depths are exact, as a multiple of it.
 _THINNEST, _NEAR = 0.002, 10.0
+
+# Largest share of the vertices of the inner wall outside the outer one; number of vertices whose
+# winding numbers are computed.
+_OUTSIDE, _MOST_SUSPECTS = 1.0 / 2000.0, 1000
 
 # Barycentric coordinate below which a point is on the edge of a face.
 _ON_EDGE = 1e-6
@@ -247,16 +252,17 @@ class FreeVessel(Vessel):
         return away
 
     def surfaces_cross(self, x: Float[np.ndarray, " unknowns"]) -> bool:
-        """Returns whether a vertex of the inner wall is outside the outer one.
+        """Returns whether more than 1 in 2000 vertices of the inner wall are outside the outer one.
 
-        Where a face of the outer wall is folded over, signed distances to its corners may have the
-        wrong sign, so a vertex counts as outside only if it is also above the tangent plane of the
-        nearest vertex. Beside a sharp edge, one 0.006 of the diameter outside may be missed.
+        Where a face of the outer wall is folded over, signed distances have the wrong sign, and
+        nothing keeps the few vertices beside it inside: winding numbers decide, and those few do
+        not count.
         """
-        outer, inner = self._surfaces(x)
-        outside = signed_distance(mesh_of(outer))(inner.vertices) >= 0.0
-        heights, _ = _above_nearest(outer, inner.vertices)
-        return bool(np.any(outside & (heights >= 0.0)))
+        outer, inner = (mesh_of(wall) for wall in self._surfaces(x))
+        suspects = inner.vertices[signed_distance(outer)(inner.vertices) >= 0.0]
+        some = suspects[:: math.ceil(len(suspects) / _MOST_SUSPECTS) or 1]
+        outside = np.sum(winding_number(outer, some) < 0.5)
+        return bool(outside * len(suspects) > _OUTSIDE * len(inner.vertices) * len(some))
 
 
 def fit_free_vessel(

@@ -139,6 +139,19 @@ def test_distances_of_wrong_sign_are_no_crossing(vessel, monkeypatch):
     assert not vessel.surfaces_cross(vessel.start())
 
 
+@pytest.mark.parametrize(("share", "crosses"), [(0.0003, False), (0.003, True)])
+def test_a_few_vertices_beside_folds_are_no_crossing(vessel, monkeypatch, share, crosses):
+    def with_some_outside(inner, outer, depth):
+        del outer, depth
+        count = max(1, round(share * len(inner.vertices)))
+        vertices = inner.vertices.copy()
+        vertices[:count] += vessel.size * np.sign(vertices[:count])
+        return inner._replace(vertices=vertices)
+
+    monkeypatch.setattr(free_vessels, "_kept_below", with_some_outside)
+    assert vessel.surfaces_cross(vessel.start()) == crosses
+
+
 @pytest.mark.parametrize("number", [0, 1])
 def test_derivatives_are_central_differences(vessel, number):
     posed_surfaces.assert_derivatives(
