@@ -25,6 +25,7 @@ from jaxtyping import Float
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import KDTree
 
+from refref_jax.choices import NO_ABSORPTION, Colour
 from refref_jax.compilation import threads
 from refref_jax.data.mesh_queries import winding_number
 from refref_jax.geometry.triangle_meshes import (
@@ -41,8 +42,9 @@ from refref_jax.reconstruct.grids import Box, Grid, find_isosurface, sample
 from refref_jax.reconstruct.interiors import Vessel
 from refref_jax.reconstruct.mesh_distance import ClosestSearch, signed_distance
 from refref_jax.reconstruct.model_selection import Trial, judged
-from refref_jax.reconstruct.photometry import Backdrop, Photographs
+from refref_jax.reconstruct.photometry import Backdrop, Photographs, TracedObject
 from refref_jax.reconstruct.shapes import FreeSurface, Posed, mesh_of, vertex_normals_of
+from refref_jax.reconstruct.smoothing import diffuse
 
 # Distance between the points of the grid of distances, as a share of the diameter.
 _SPACING = 1.0 / 150.0
@@ -76,14 +78,20 @@ _PIXELS, _BLUR = 3000, 1
 # Indices of refraction of the liquids that are begun with: near those of water and of oil.
 _LIQUIDS = (1.36, 1.45)
 
-# Blurs of the first steps, which choose the contents, of the others, and of the finest ones; number
-# of pixels of each.
-_FIRST, _OTHERS, _FINEST = (2, 2, 1), (1, *[0] * 15), (0,) * 24
+# Products of absorption and diameter that are looked at.
+_DENSITIES = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
+
+# Blurs of the first steps, which choose the contents, of the others, and of the finest ones, in
+# rounds, before each of which both walls are smoothed; number of pixels of each.
+_FIRST, _OTHERS, _FINEST = (2, 2, 1), (1, *[0] * 15), ((0,) * 8, (0,) * 8, (0,) * 7, (0,))
 _FIRST_RAYS, _RAYS, _FINEST_RAYS, _JUDGES = 12_000, 24_000, 48_000, 8192
 
-# Share of the pixels of largest derivatives that a step leaves out, least scale of the robust
-# weights in the first step, sRGB, and least gain of a step.
-_OUTLIERS, _WIDEST, _GAIN = 0.02, 0.3, 0.002
+# Lengths over which the outer and the inner wall are smoothed, as shares of the diameter.
+_SMOOTHINGS = (0.006, 0.010)
+
+# What all steps share: pixels of the largest derivatives are left out, robust weights are wide at
+# first, and a fit ends after two steps of little gain.
+_STEPS = Steps(judges=_JUDGES, outliers=0.02, widest=0.3, gain=0.002)
 
 # Ratio of its error after the first steps to that of the best other shape beyond which a vessel is
 # given up; and to that of the other contents. While normals are far off, air has the advantage that
@@ -198,12 +206,17 @@ class FreeVessel(Vessel):
     def finer(self, x: Float[np.ndarray, " unknowns"]) -> "FreeVessel":
         """Returns the vessel of given unknowns as one at rest that has more handles.
 
-        Its prior expects no displacements from there, and the same indices of refraction.
+        Its prior expects no displacements from there, and the same indices of refraction. Both
+        walls are smoothed: ripples as narrow as the distance between handles come from the masks
+        and from the handles themselves, and neither light nor the prior takes them away.
 
         Raises:
           ReconstructionError: if a wall is inside out.
         """
-        outer, inner = (mesh_of(wall) for wall in self._surfaces(x))
+        outer, inner = (
+            diffuse(mesh_of(wall), length * self.size)
+            for wall, length in zip(self._surfaces(x), _SMOOTHINGS, strict=True)
+        )
         now, known = self.interior(x), self._expected
         found = FreeVessel(outer, inner, now, spacings=_FINE, expected=known)
         if found.layout.count <= _MOST:
@@ -302,7 +315,7 @@ def fit_free_vessel(
     air = Interior("air", glass=glass, glass_deviation=glass_deviation, stained=True)
     liquid = dataclasses.replace(air, contents="liquid", stained=False)
     hypotheses = [air, *(dataclasses.replace(liquid, liquid=index) for index in _LIQUIDS)]
-    others, finest = len(_OTHERS) * _RAYS, len(_FINEST) * _FINEST_RAYS
+    others, finest = len(_OTHERS) * _RAYS, sum(map(len, _FINEST)) * _FINEST_RAYS
     total, done = len(hypotheses) * (len(_FIRST) * _FIRST_RAYS + others) + finest, 0
 
     def fitted(vessel: FreeVessel, x: np.ndarray, blurs: tuple[int, ...], rays: int) -> _Fitted:
@@ -314,7 +327,7 @@ def fit_free_vessel(
             x,
             surface,
             pixels,
-            settings=Steps(blurs, rays, _JUDGES, _OUTLIERS, seed=seed, widest=_WIDEST, gain=_GAIN),
+            settings=dataclasses.replace(_STEPS, blurs=blurs, rays=rays, seed=seed + len(found)),
             outlines=outlines,
             progress=lambda step, facts: progress(
                 (begin + step * rays) / total, f"{name}: {facts.after:.4f}"
@@ -331,11 +344,13 @@ def fit_free_vessel(
     if errors and min(errors) < _HOPELESS * rival:
         close = [each for each in found if each.error() <= _WORSE * min(errors)]
         found += [fitted(each.vessel, each.trial.fit.x, _OTHERS, _RAYS) for each in close]
-        best, done = _best(found), total - finest
-        if best is not None:
+        done = total - finest
+        for blurs in _FINEST:
+            best = _best(found)
             with contextlib.suppress(ReconstructionError):
-                finer = best.vessel.finer(best.trial.fit.x)
-                found.append(fitted(finer, finer.start(), _FINEST, _FINEST_RAYS))
+                if best is not None:
+                    finer = best.vessel.finer(best.trial.fit.x)
+                    found.append(fitted(finer, finer.start(), blurs, _FINEST_RAYS))
     best = _best(found)
     return None if best is None else best.trial
 
@@ -374,7 +389,8 @@ def _best_wall(
             inner = inner_wall(mesh, shape, distances, rounding=rounding * size)
             vessel = FreeVessel(mesh, inner, shape)
             traced = gauss_newton.traced_object(vessel.pose(vessel.start()))
-            error = float(gauss_newton.errors_of(traced, blurred, pixels).mean())
+            error, absorption = _best_absorption(traced, blurred, pixels, size, filled=at.filled)
+            vessel.interior_at_start = dataclasses.replace(shape, absorption=absorption)
             found.append(_Look(error, wall, rounding, vessel))
 
     for wall, rounding in itertools.product(_WALLS, _ROUNDINGS):
@@ -385,6 +401,27 @@ def _best_wall(
     for base in _BASES[1:]:
         look(best.wall, base, best.rounding)
     return min(found, key=lambda each: each.error).vessel
+
+
+def _best_absorption(
+    traced: TracedObject, surface: Backdrop, pixels: Photographs, size: float, *, filled: bool
+) -> tuple[float, Colour]:
+    """Returns the error of pixels, and the absorption of the liquid that makes it least.
+
+    A liquid that bends light like the glass around it is seen by its absorption alone. All light of
+    a pixel is taken to be absorbed like that of its main path.
+    """
+    seen = photometry.predict(traced, surface, pixels.rays)
+    if not filled:
+        return float(gauss_newton.robust_errors(seen, pixels.rgb).mean()), NO_ABSORPTION
+    inside = photometry.sensitivities(traced, surface, pixels.rays, seen).lengths[:, 1:2]
+    densities = np.array(_DENSITIES) / size
+    dimmed = seen.linear * np.exp(-densities[:, None, None] * inside)
+    errors = np.abs(photometry.residuals(dimmed, pixels.rgb)).mean(axis=1)
+    red, green, blue = densities[np.argmin(errors, axis=0)]
+    best = seen._replace(linear=seen.linear * np.exp(-inside * [red, green, blue]))
+    error = float(gauss_newton.robust_errors(best, pixels.rgb).mean())
+    return error, (float(red), float(green), float(blue))
 
 
 class _Look(NamedTuple):

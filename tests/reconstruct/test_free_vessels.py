@@ -1,12 +1,14 @@
 """Vessels of any shape: their two surfaces, and what light tells of the wall."""
 
+import dataclasses
 import functools
 
 import jax
 import numpy as np
 import pytest
 
-from refref_jax.geometry.triangle_meshes import diameter, make_mesh, volume
+from refref_jax.choices import NO_ABSORPTION
+from refref_jax.geometry.triangle_meshes import diameter, face_normals, make_mesh, volume
 from refref_jax.reconstruct import ReconstructionError, free_vessels, gauss_newton, photometry
 from refref_jax.reconstruct.contents import Interior
 from refref_jax.reconstruct.free_vessels import FreeVessel, distances_to, inner_wall
@@ -125,12 +127,40 @@ def test_the_wall_the_rounding_and_then_the_base_that_suit_best_are_taken(
     monkeypatch.setattr(free_vessels, "inner_wall", wall)
     monkeypatch.setattr(free_vessels, "FreeVessel", Numbers)
     monkeypatch.setattr(gauss_newton, "traced_object", lambda candidate: candidate)
-    monkeypatch.setattr(gauss_newton, "errors_of", lambda traced, *_: np.abs(traced - best))
+    monkeypatch.setattr(
+        free_vessels,
+        "_best_absorption",
+        lambda traced, *_, filled: (float(np.abs(traced - best).mean()), NO_ABSORPTION),
+    )
     world, pixels = vessels.smooth_backdrop(), black_pixels()
     found = free_vessels._best_wall(mesh, Interior("air"), inside, world, pixels)
     assert (found is not None) == fits
     if fits:
         np.testing.assert_allclose(found.numbers, best)
+
+
+def test_liquids_are_told_by_their_absorption_alone(mesh, inside):
+    """Of the same index as the glass, so that light goes straight on from one into the other."""
+    surface, (rays, views) = vessels.smooth_backdrop(), lit_scenes.pixels(400, reach=0.9)
+    size = diameter(mesh.vertices)
+    densities = np.array([free_vessels._DENSITIES[n] for n in (4, 1, 0)])
+    errors = []
+    for wall in (0.1, 0.3, 0.5):
+        shape = Interior("liquid", glass=1.45, liquid=1.45, wall=wall)
+        traced = []
+        for absorption in ((0.0, 0.0, 0.0), tuple((densities / size).tolist())):
+            vessel = vessel_with(mesh, dataclasses.replace(shape, absorption=absorption), inside)
+            traced.append(gauss_newton.traced_object(vessel.pose(vessel.start())))
+        clear, coloured = traced
+        if not errors:
+            rgb = photometry.encode(photometry.predict(coloured, surface, rays).linear)
+            seen = Photographs(jax.device_get(rays), rgb, views)
+        error, found = free_vessels._best_absorption(clear, surface, seen, size, filled=True)
+        errors.append(error)
+        if wall == 0.1:
+            np.testing.assert_allclose(found, densities / size)
+    without, _ = free_vessels._best_absorption(clear, surface, seen, size, filled=False)
+    assert errors[0] < 0.5 * errors[1] < 0.5 * errors[2] < 0.5 * without
 
 
 def test_distances_of_wrong_sign_are_no_crossing(vessel, monkeypatch):
@@ -175,14 +205,22 @@ def test_the_inner_wall_follows_the_outer_one(vessel):
     np.testing.assert_allclose(np.linalg.norm(thinner, axis=-1), 0.03, atol=1e-9)
 
 
-def test_a_finer_vessel_is_the_same_with_more_handles(vessel):
+def test_a_finer_vessel_is_the_same_but_smoother_and_has_more_handles(vessel):
     x = vessel.start() + 0.001 * np.random.default_rng(0).normal(size=vessel.layout.count)
     finer = vessel.finer(x)
     for one, other in zip(vessel.solids(x), finer.solids(finer.start()), strict=True):
-        np.testing.assert_array_equal(other.mesh.vertices, one.mesh.vertices)
-        np.testing.assert_allclose(other.mesh.normals, one.mesh.normals, atol=1e-9)
+        moved = np.linalg.norm(other.mesh.vertices - one.mesh.vertices, axis=-1)
+        assert np.median(moved) < 0.001 * vessel.size
+        volumes = [volume(each.mesh.vertices, each.mesh.faces) for each in (one, other)]
+        np.testing.assert_allclose(volumes[1], volumes[0], rtol=1e-4)
         assert other.index == one.index
         np.testing.assert_allclose(other.tint, one.tint, rtol=1e-12)
+    even, uneven, smoothed = (
+        face_normals(wall.vertices[wall.faces])
+        for made, at in ((vessel, vessel.start()), (vessel, x), (finer, finer.start()))
+        for wall in made.pose(at).parts[:1]
+    )
+    assert np.linalg.norm(smoothed - even) < 0.95 * np.linalg.norm(uneven - even)
     counts = [
         [each.stop - each.start for each in (made.layout.outer, made.layout.inner)]
         for made in (vessel, finer)
@@ -243,22 +281,25 @@ def test_what_it_cannot_be_is_refused(mesh, inside, interior, message):
 
 
 @pytest.mark.parametrize(
-    ("errors", "crossing", "best"),
+    ("errors", "rounds", "crossing", "best"),
     [
-        ((0.3, 0.4, 0.5, 0.2, 0.1), (), 4),
-        ((0.3, 0.4, 0.5, 0.2, 0.25), (), 3),
-        ((0.3, 0.4, 0.5, 0.2, 0.1), (4,), 3),
-        ((0.3, 0.4, 0.5, 0.2, 0.1), (3, 4), 0),
-        ((0.3, 0.4, 0.5, 0.2, 0.1), (0, 3, 4), 1),
-        ((0.3, 0.4, 0.5, 0.2, 0.1), (0, 1, 2, 3, 4), None),
+        ((0.3, 0.4, 0.5, 0.2, 0.1), 1, (), 4),
+        ((0.3, 0.4, 0.5, 0.2, 0.25), 1, (), 3),
+        ((0.3, 0.4, 0.5, 0.2, 0.1), 1, (4,), 3),
+        ((0.3, 0.4, 0.5, 0.2, 0.1), 1, (3, 4), 0),
+        ((0.3, 0.4, 0.5, 0.2, 0.1), 1, (0, 3, 4), 1),
+        ((0.3, 0.4, 0.5, 0.2, 0.1), 1, (0, 1, 2, 3, 4), None),
         # Contents that are hardly worse at first get further steps, too.
-        ((0.3, 0.32, 0.4, 0.2, 0.18, 0.1), (), 5),
-        ((0.3, 0.32, 0.4, 0.2, 0.18, 0.19), (), 4),
-        ((0.32, 0.4, 0.3, 0.2, 0.18, 0.1), (4, 5), 3),
+        ((0.3, 0.32, 0.4, 0.2, 0.18, 0.1), 1, (), 5),
+        ((0.3, 0.32, 0.4, 0.2, 0.18, 0.19), 1, (), 4),
+        ((0.32, 0.4, 0.3, 0.2, 0.18, 0.1), 1, (4, 5), 3),
+        # Each round of finest steps begins where the best one ended.
+        ((0.3, 0.4, 0.5, 0.2, 0.1, 0.09, 0.08, 0.07), 4, (), 7),
+        ((0.3, 0.4, 0.5, 0.2, 0.1, 0.11, 0.08, 0.07), 4, (7,), 6),
     ],
 )
 def test_the_best_vessel_whose_walls_do_not_cross_is_kept(
-    mesh, vessel, inside, monkeypatch, errors, crossing, best
+    mesh, vessel, inside, monkeypatch, errors, rounds, crossing, best
 ):
     made, shares = [], []
 
@@ -270,6 +311,7 @@ def test_the_best_vessel_whose_walls_do_not_cross_is_kept(
         made.append(Trial(name, model, fit, np.array([errors[len(made)]])))
         return made[-1]
 
+    monkeypatch.setattr(free_vessels, "_FINEST", ((0,),) * rounds)
     monkeypatch.setattr(free_vessels, "distances_to", lambda mesh: inside)
     monkeypatch.setattr(free_vessels, "_best_wall", lambda mesh, at, *_: vessel)
     monkeypatch.setattr(free_vessels, "judged", judged)
