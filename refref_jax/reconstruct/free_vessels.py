@@ -25,7 +25,6 @@ from jaxtyping import Float
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import KDTree
 
-from refref_jax.choices import NO_ABSORPTION, Colour
 from refref_jax.compilation import threads
 from refref_jax.data.mesh_queries import winding_number
 from refref_jax.geometry.triangle_meshes import (
@@ -59,8 +58,8 @@ _MOST = 6000
 # vertex within which depths are exact, as a multiple of it.
 _THINNEST, _NEAR = 0.002, 10.0
 
-# Largest share of the vertices of the inner wall outside the outer one; number of vertices whose
-# winding numbers are computed.
+# Largest share of the vertices of the inner wall outside the outer one; largest number of vertices
+# whose winding numbers are computed.
 _OUTSIDE, _MOST_SUSPECTS = 1.0 / 2000.0, 1000
 
 # Barycentric coordinate below which a point is on the edge of a face.
@@ -78,11 +77,14 @@ _PIXELS, _BLUR = 3000, 1
 # Indices of refraction of the liquids that are begun with: near those of water and of oil.
 _LIQUIDS = (1.36, 1.45)
 
-# Products of absorption and diameter that are looked at.
+# Products of absorption and diameter, and minus logarithms of the tint of stained glass, that are
+# looked at.
 _DENSITIES = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
+_STAINS = (0.0, 0.05, 0.1, 0.2, 0.3, 0.45, 0.7)
 
-# Blurs of the first steps, which choose the contents, of the others, and of the finest ones, in
-# rounds, before each of which both walls are smoothed; number of pixels of each.
+# Blurs of the first steps, which choose the contents, of the others, and of the finest ones; number
+# of pixels of a step. The finest steps are taken in rounds: before each, both walls are smoothed,
+# and robust weights begin wide again.
 _FIRST, _OTHERS, _FINEST = (2, 2, 1), (1, *[0] * 15), ((0,) * 8, (0,) * 8, (0,) * 7, (0,))
 _FIRST_RAYS, _RAYS, _FINEST_RAYS, _JUDGES = 12_000, 24_000, 48_000, 8192
 
@@ -208,10 +210,11 @@ class FreeVessel(Vessel):
 
         Its prior expects no displacements from there, and the same indices of refraction. Both
         walls are smoothed: ripples as narrow as the distance between handles come from the masks
-        and from the handles themselves, and neither light nor the prior takes them away.
+        and from the handles themselves, and neither light nor the prior takes them away. Thin limbs
+        of the inside become shorter.
 
         Raises:
-          ReconstructionError: if a wall is inside out.
+          ReconstructionError: if a smoothed wall is inside out or encloses nothing.
         """
         outer, inner = (
             diffuse(mesh_of(wall), length * self.size)
@@ -347,7 +350,7 @@ def fit_free_vessel(
         done = total - finest
         for blurs in _FINEST:
             best = _best(found)
-            with contextlib.suppress(ReconstructionError):
+            with contextlib.suppress(ReconstructionError):  # smoothed walls may be inside out
                 if best is not None:
                     finer = best.vessel.finer(best.trial.fit.x)
                     found.append(fitted(finer, finer.start(), blurs, _FINEST_RAYS))
@@ -389,8 +392,8 @@ def _best_wall(
             inner = inner_wall(mesh, shape, distances, rounding=rounding * size)
             vessel = FreeVessel(mesh, inner, shape)
             traced = gauss_newton.traced_object(vessel.pose(vessel.start()))
-            error, absorption = _best_absorption(traced, blurred, pixels, size, filled=at.filled)
-            vessel.interior_at_start = dataclasses.replace(shape, absorption=absorption)
+            error, coloured = _best_colour(traced, blurred, pixels, shape, size)
+            vessel.interior_at_start = coloured  # which `start` reads
             found.append(_Look(error, wall, rounding, vessel))
 
     for wall, rounding in itertools.product(_WALLS, _ROUNDINGS):
@@ -403,25 +406,29 @@ def _best_wall(
     return min(found, key=lambda each: each.error).vessel
 
 
-def _best_absorption(
-    traced: TracedObject, surface: Backdrop, pixels: Photographs, size: float, *, filled: bool
-) -> tuple[float, Colour]:
-    """Returns the error of pixels, and the absorption of the liquid that makes it least.
+def _best_colour(
+    traced: TracedObject, surface: Backdrop, pixels: Photographs, clear: Interior, size: float
+) -> tuple[float, Interior]:
+    """Returns the robust error of pixels with the colour that suits them best, and such contents.
 
-    A liquid that bends light like the glass around it is seen by its absorption alone. All light of
-    a pixel is taken to be absorbed like that of its main path.
+    It is the absorption of a liquid, or else the tint of the glass. A liquid that bends light like
+    the glass around it is seen by its absorption alone. Channels are chosen one by one, by mean
+    absolute errors. All light of a pixel is taken to be dimmed like that of its main path.
     """
     seen = photometry.predict(traced, surface, pixels.rays)
-    if not filled:
-        return float(gauss_newton.robust_errors(seen, pixels.rgb).mean()), NO_ABSORPTION
-    inside = photometry.sensitivities(traced, surface, pixels.rays, seen).lengths[:, 1:2]
-    densities = np.array(_DENSITIES) / size
-    dimmed = seen.linear * np.exp(-densities[:, None, None] * inside)
+    paths = photometry.sensitivities(traced, surface, pixels.rays, seen)
+    # The liquid is the second part.
+    amounts = paths.lengths[:, 1:2] if clear.filled else paths.crossings[:, :1]
+    strengths = np.array(_DENSITIES) / size if clear.filled else np.array(_STAINS)
+    dimmed = seen.linear * np.exp(-strengths[:, None, None] * amounts)
     errors = np.abs(photometry.residuals(dimmed, pixels.rgb)).mean(axis=1)
-    red, green, blue = densities[np.argmin(errors, axis=0)]
-    best = seen._replace(linear=seen.linear * np.exp(-inside * [red, green, blue]))
-    error = float(gauss_newton.robust_errors(best, pixels.rgb).mean())
-    return error, (float(red), float(green), float(blue))
+    best = strengths[np.argmin(errors, axis=0)]
+    seen = seen._replace(linear=seen.linear * np.exp(-amounts * best))
+    error = float(gauss_newton.robust_errors(seen, pixels.rgb).mean())
+    red, green, blue = best.tolist() if clear.filled else np.exp(-best).tolist()
+    if clear.filled:
+        return error, dataclasses.replace(clear, absorption=(red, green, blue))
+    return error, dataclasses.replace(clear, glass_tint=(red, green, blue))
 
 
 class _Look(NamedTuple):
