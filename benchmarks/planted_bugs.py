@@ -56,8 +56,8 @@ class Outcome(NamedTuple):
     Attributes:
       name: name of the bug.
       caught: whether a test failed.
-      test: the test that failed, or why none did.
-      seconds: how long the tests took.
+      test: name of the test that failed, or why none did.
+      seconds: duration of the tests.
     """
 
     name: str

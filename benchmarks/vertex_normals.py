@@ -74,7 +74,7 @@ class Errors(NamedTuple):
     """Angles to the true normals, in degrees: mean, 99 % quantile and largest.
 
     Attributes:
-      vertices: at the corners of the faces.
+      vertices: errors of normals at the corners of the faces.
       surface: errors of interpolated normals at random points.
     """
 

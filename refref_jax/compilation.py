@@ -42,7 +42,7 @@ class XlaFlag(NamedTuple):
       text: flag and value.
       versions: versions of jaxlib that need it; others may refuse it.
       suffices: parts of flags with the same effect, or by which users choose for themselves.
-      problem: what happens without it.
+      problem: consequence of its absence.
       source: issue that reports the problem.
     """
 

@@ -255,7 +255,7 @@ def shape_from_outlines(
 
     Args:
       mesh: closed mesh of the object, from masks.
-      views: these masks and their cameras.
+      views: masks and their cameras.
       carved: the mesh before it was smoothed, which rounds its corners.
       seed: seed of the draws of points.
       progress: function called with the number of fits done, their total, and a line of text.

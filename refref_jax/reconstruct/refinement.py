@@ -105,7 +105,7 @@ class Refinement:
         quartered if the masks show that it would move outlines.
       crease: angle between neighbouring faces at which denoising stops, radians.
       smoothing: diffusion length of the vertices, which also rounds creases, world units.
-      convex_depth: an object is made convex if no vertex lies deeper below its hull, world units.
+      convex_depth: largest depth below its hull at which an object is made convex, world units.
       corners: largest number of corners of a convex object fitted to masks; 0 skips the stage.
       rounding: radius to which convex edges are rounded, world units.
       spacing: spacing of the signed distance grid from which the surface is remeshed, world units.

@@ -93,7 +93,7 @@ class Wall:
     Attributes:
       at: lengths along the profile at rest of the points of its spline.
       length: length of the profile at rest.
-      points: these points at rest: radius and height.
+      points: positions of these points at rest: radius and height.
       directions: outward unit normals at rest.
       knots: lengths along the profile at rest of the knots of the offsets.
       hats: offset of each point by that of each knot.

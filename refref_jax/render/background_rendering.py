@@ -330,7 +330,7 @@ def _first_image(camera: _Camera, count: int, fewest: int) -> tuple[KnownImage, 
     """Returns an image that is not encoded yet, and its rays.
 
     Args:
-      camera: what is rendered.
+      camera: camera and the scene that it sees.
       count: number of rays in each pixel.
       fewest: least number of rays in a pixel beside the objects; above 1, `count` must be 1, since
         rays of other pixels are repeated.
@@ -359,7 +359,7 @@ def _refined(
     """Refines pixels; the arrays of the image change.
 
     Args:
-      camera: what is rendered.
+      camera: camera and the scene that it sees.
       image: image of few rays in each pixel.
       first: its rays.
       again: rows and columns of the pixels.

@@ -157,9 +157,9 @@ def test_the_wall_of_a_liquid_is_seen_by_its_absorption_alone(mesh, inside):
     brown = vessel_with(mesh, dataclasses.replace(thin, absorption=tuple(true.tolist())), inside)
     seen, errors = _photograph(brown, surface, rays, views), []
     for wall in (0.1, 0.3, 0.5):
-        vessel = vessel_with(mesh, dataclasses.replace(thin, wall=wall), inside)
-        traced = gauss_newton.traced_object(vessel.pose(vessel.start()))
         shape = dataclasses.replace(thin, wall=wall)
+        vessel = vessel_with(mesh, shape, inside)
+        traced = gauss_newton.traced_object(vessel.pose(vessel.start()))
         error, coloured = free_vessels._best_colour(traced, surface, seen, shape, size)
         errors.append(error)
         if wall == thin.wall:
