@@ -303,7 +303,7 @@ def follow_main_branches(
 
     Example:
       A glass cube in front of a red wall, and the derivative of its colour with respect to the
-      index: with a higher index, more of the black behind the camera is reflected.
+      index. The higher the index, the more of the black behind the camera is reflected.
 
       >>> import jax, numpy as np, trimesh
       >>> import refref_jax

@@ -97,13 +97,18 @@ def interact(
         facet = facet if tilt is None else fresnel.tilted(facet, tilt)
     near, far = sides.index_near, sides.index_far
     beta = -numerics.dot(direction, facet)
+    total = fresnel.transmission(beta, near, far).total
+    # Nothing is transmitted in total internal reflection, where `refract` returns a tangent as long
+    # as the ratio of indices: `_on_side` would take the root of a negative number, and its NaN
+    # would reach the gradient of the reflected ray.
+    refracted = jnp.where(total, direction, fresnel.refract(direction, facet, near, far))
     # Directions are renormalised, or rounding errors would accumulate over bends.
     met = Interaction(
         position=point.position,
         reflectance=fresnel.reflectance(beta, near, far),
-        total=fresnel.transmission(beta, near, far).total,
+        total=total,
         reflected=numerics.renormalize(fresnel.reflect(direction, facet)),
-        transmitted=numerics.renormalize(fresnel.refract(direction, facet, near, far)),
+        transmitted=numerics.renormalize(refracted),
         restart_reflected=numerics.offset_origin(point.position, geometric, point.scale),
         restart_transmitted=numerics.offset_origin(point.position, -geometric, point.scale),
         sides=sides,

@@ -142,8 +142,7 @@ class Sensitivities(NamedTuple):
       crossings: number of times that the main path meets each part.
       lengths: length of the main path in the medium of each part, world units.
       coverage: number of pixels that see the backdrop where the path ends.
-      usable: whether the path leaves the object within the number of bends, and its derivatives are
-        finite; they are 0 where they would not be.
+      usable: whether the path leaves the object within the number of bends.
     """
 
     primitives: Int[Any, "rays bends"]
@@ -344,7 +343,6 @@ def _differentiate(
     found_by, ends = jax.vmap(by, in_axes=(0, 0, None, None, 0, 0, 0))(
         triangles, normals, indices, absorptions, parts, primitives, rays
     )
-    found_by, finite = _only_finite(found_by)
     by_corners, by_normals, by_indices, by_absorptions = found_by
     share = jnp.mean(ends.throughput, axis=-1)
     # The share falls by its own size for each unit of length and of absorption.
@@ -368,21 +366,9 @@ def _differentiate(
         crossings=crossings,
         lengths=lengths,
         coverage=backdrop.radiance(coverage, lookups)[:, 0],
-        usable=finite & (ends.statuses == PathStatus.ESCAPED),
+        usable=ends.statuses == PathStatus.ESCAPED,
     )
     return found, radiance, share
-
-
-def _only_finite(tree: _Tree) -> tuple[_Tree, Bool[Array, " rays"]]:
-    """Returns the derivatives, 0 for rays of which any is not finite, and which rays are kept.
-
-    Paths that are reflected again and again inside a rough surface of a high index multiply a
-    change by 10 at each bend, which float32 does not always hold.
-    """
-    flat = [x.reshape(x.shape[0], -1) for x in jax.tree.leaves(tree)]
-    finite = jnp.all(jnp.isfinite(jnp.concatenate(flat, axis=1)), axis=1)
-    keep = lambda x: jnp.where(finite.reshape(-1, *[1] * (x.ndim - 1)), x, 0.0)  # noqa: E731
-    return jax.tree.map(keep, tree), finite
 
 
 def _replay(

@@ -108,6 +108,42 @@ def test_slopes_are_finite_where_a_ray_is_turned(degrees):
     assert np.all(np.isfinite(slope))
 
 
+@jax.jit
+def _leave(index, slope, lean):
+    """Leaves glass of an index; returns both directions, and derivatives of the reflected one."""
+    nowhere = media.empty_interior_list(_GLASS)
+    point = SurfacePoint(
+        position=jnp.zeros(3),
+        geometric_normal=jnp.array([0.0, 0.0, 1.0]),
+        shading_normal=jnp.zeros(3),
+        part=jnp.int32(0),
+        scale=jnp.float32(1.0),
+    )
+
+    def directions(index, slope, lean):
+        glass = _GLASS._replace(index_inside=index[None])
+        shading = jnp.stack([jnp.sin(lean), jnp.zeros_like(lean), jnp.cos(lean)])
+        incident = jnp.stack([jnp.cos(slope), jnp.zeros_like(slope), jnp.sin(slope)])
+        met = path_step.interact(point._replace(shading_normal=shading), glass, nowhere, incident)
+        followed = jnp.where(met.total, met.reflected, met.transmitted)
+        return followed, (met.reflected, met.transmitted, met.total)
+
+    return jax.jacrev(directions, argnums=(0, 1, 2), has_aux=True)(index, slope, lean)
+
+
+@pytest.mark.parametrize("index", [1.5, 2.4, 4.0])
+def test_total_reflection_is_finite_for_high_indices_and_leaning_normals(index):
+    slopes, leans = np.meshgrid(np.radians(np.arange(1, 90, 3)), np.radians(np.arange(-60, 61, 3)))
+    each = jax.vmap(_leave, in_axes=(None, 0, 0))
+    arrays = [jax.device_put(x.ravel().astype(np.float32)) for x in (slopes, leans)]
+    slope, (reflected, transmitted, total) = each(jax.device_put(np.float32(index)), *arrays)
+    assert 0.1 < np.mean(total) < 1.0
+    for found in (*slope, reflected, transmitted):
+        assert np.all(np.isfinite(found))
+    for unit in (reflected, transmitted):
+        np.testing.assert_allclose(np.linalg.norm(unit, axis=-1), 1.0, atol=2e-6)
+
+
 def test_the_shading_normal_bends_the_ray():
     flat, leaning = _meet([0.2, 0.0, -1.0]), _meet([0.2, 0.0, -1.0], shading=(0.1, 0.0, 1.0))
     assert np.linalg.norm(flat.transmitted - leaning.transmitted) > 0.02

@@ -2,7 +2,6 @@
 
 import functools
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -289,53 +288,6 @@ def test_sensitivities_are_central_differences_of_predictions(world, ball, kind,
     slopes = slopes[found.usable].ravel()
     assert np.corrcoef(slopes, expected)[0, 1] > 0.95
     assert slopes @ expected / (slopes @ slopes) == pytest.approx(1.0, abs=off)
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_derivatives_of_a_ray_are_kept_together_or_not_at_all(bad):
-    by_corners = np.arange(24.0, dtype=np.float32).reshape(4, 3, 2)
-    by_indices = np.ones((4, 3), np.float32)
-    by_corners[1, 2, 0], by_indices[3, 1] = bad, bad
-    kept, finite = photometry._only_finite((jax.device_put(by_corners), jax.device_put(by_indices)))
-    np.testing.assert_array_equal(finite, [True, False, True, False])
-    for after, before in zip(kept, (by_corners, by_indices), strict=True):
-        np.testing.assert_array_equal(after[::2], before[::2])
-        np.testing.assert_array_equal(after[1::2], np.zeros_like(before[1::2]))
-
-
-@pytest.mark.slow
-def test_a_ray_without_finite_derivatives_is_not_used(world, ball, monkeypatch):
-    rays, _ = _rays(2, reach=0.85)
-    body = gauss_newton.traced_object(_changed(ball, "index", 0.0))
-    predicted = photometry.predict(body, world, rays)
-    expected = photometry.sensitivities(body, world, rays, predicted)
-    follow, differentiate = photometry.follow_branch, photometry._differentiate.__wrapped__
-    broken, some = 5, np.asarray(rays.directions[5])
-
-    def overflow(scene, ray, *arguments, **options):
-        path = follow(scene, ray, *arguments, **options)
-        here = jnp.all(ray.directions == some)
-        index = jnp.where(here, scene.interfaces.index_inside[0], 1.0)
-        # Its value is 0, its derivative 0 / 0 where `index` is not a constant.
-        zero = jnp.sqrt(index - index)
-        return path._replace(directions=path.directions + zero)
-
-    monkeypatch.setattr(photometry, "follow_branch", overflow)
-    monkeypatch.setattr(
-        photometry,
-        "_differentiate",
-        jax.jit(
-            lambda *a, **k: differentiate.__wrapped__(*a, **k),
-            static_argnames=("domain", "resolution"),
-        ),
-    )
-    found = photometry.sensitivities(body, world, rays, predicted)
-    assert expected.usable[broken] and not found.usable[broken]
-    assert all(np.all(np.isfinite(each)) for each in found)
-    assert not any(np.any(each[broken]) for each in (found.by_corners, found.by_indices))
-    others = np.arange(len(rays.origins)) != broken
-    for each, before in zip(found, expected, strict=True):
-        np.testing.assert_allclose(each[others], before[others], rtol=2e-3, atol=2e-3)
 
 
 @pytest.mark.parametrize("absorption", [0.0, 0.5, 1e6])
