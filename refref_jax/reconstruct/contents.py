@@ -15,6 +15,9 @@ from refref_jax.optics.media import INDEX_OF_AIR, Interfaces
 GLASS_DEVIATION = 0.03
 """Standard deviation of the index of glass, which is nearly known."""
 
+# Number of interfaces of every vessel: those without faces let all share one compiled program.
+_PARTS = 3
+
 Contents = Literal["none", "air", "liquid", "liquid and air"]
 """What is inside the glass; `none` is solid glass."""
 
@@ -91,6 +94,12 @@ class Interior:
     def name(self) -> str:
         """What is inside, in words."""
         return self.contents + ", open" * self.mouth + ", stained" * self.stained
+
+    @property
+    def materials(self) -> list[str]:
+        """Material of each part, the glass first."""
+        air = self.contents in ("air", "liquid and air") and not self.mouth
+        return ["glass", *(["liquid"] if self.filled else []), *(["air"] if air else [])]
 
     @property
     def level_unknown(self) -> bool:
@@ -176,14 +185,16 @@ class Medium:
     absorption_at: slice
 
 
-def media_of(now: Interior, at: Layout) -> dict[str, Medium]:
-    """Returns the materials of a vessel by their names, and where their unknowns are."""
+def media_of(now: Interior, at: Layout) -> list[Medium]:
+    """Returns the medium of each part of a vessel, and of those without faces."""
     fixed, clear = slice(0), NO_ABSORPTION
-    return {
+    media = {
         "glass": Medium(now.glass, now.glass_tint, clear, at.glass, at.glass_tint, fixed),
         "liquid": Medium(now.liquid, now.tint, now.absorption, at.liquid, at.tint, at.absorption),
         "air": Medium(INDEX_OF_AIR, CLEAR, clear, fixed, fixed, fixed),
     }
+    materials = now.materials
+    return [media[name] for name in materials + ["air"] * (_PARTS - len(materials))]
 
 
 def interfaces_of(media: Sequence[Medium]) -> Interfaces:

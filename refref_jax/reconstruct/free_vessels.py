@@ -1,11 +1,10 @@
 """Vessels of any shape that are full of air or of liquid: two free surfaces, as unknowns of a fit.
 
-The inner wall is a level set of the distance from the outer one, whose edges may be rounded, above
-a flat base. Both are free surfaces (`shapes.FreeSurface`). The inner one follows the outer one, so
-that the wall keeps its thickness where light says nothing, and has handles of its own, fewer.
-Where it would come out of the outer one, it stays a little below it. In the last steps, handles are
-half as far apart: at 1/44 of the diameter they cannot represent the normals of a figure with limbs
-to better than 3 degrees.
+The inner wall begins as the best one that `interior_looks` finds. Both walls are free surfaces
+(`shapes.FreeSurface`). The inner one follows the outer one, so that the wall keeps its thickness
+where light says nothing, and has handles of its own, fewer. Where it would come out of the outer
+one, it stays a little below it. In the last steps, handles are half as far apart: at 1/44 of the
+diameter they cannot represent the normals of a figure with limbs to better than 3 degrees.
 
 What this cannot represent: the surface of a liquid, and open mouths.
 
@@ -14,18 +13,16 @@ Source: ours.
 
 import contextlib
 import dataclasses
-import itertools
 import math
+import operator
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse
 from jaxtyping import Float
-from scipy.ndimage import gaussian_filter
 from scipy.spatial import KDTree
 
-from refref_jax.compilation import threads
 from refref_jax.data.mesh_queries import winding_number
 from refref_jax.geometry.triangle_meshes import (
     Mesh,
@@ -34,19 +31,16 @@ from refref_jax.geometry.triangle_meshes import (
     unit_vectors,
     with_short_edges,
 )
-from refref_jax.reconstruct import ReconstructionError, gauss_newton, photometry
+from refref_jax.reconstruct import ReconstructionError, gauss_newton
 from refref_jax.reconstruct.contents import GLASS_DEVIATION, Interior, Layout
 from refref_jax.reconstruct.gauss_newton import Candidate, Rows, Steps
-from refref_jax.reconstruct.grids import Box, Grid, find_isosurface, sample
+from refref_jax.reconstruct.interior_looks import best_free_looks
 from refref_jax.reconstruct.interiors import Vessel
 from refref_jax.reconstruct.mesh_distance import ClosestSearch, signed_distance
 from refref_jax.reconstruct.model_selection import Trial, judged
-from refref_jax.reconstruct.photometry import Backdrop, Photographs, TracedObject
+from refref_jax.reconstruct.photometry import Backdrop, Photographs
 from refref_jax.reconstruct.shapes import FreeSurface, Posed, mesh_of, vertex_normals_of
 from refref_jax.reconstruct.smoothing import diffuse
-
-# Distance between the points of the grid of distances, as a share of the diameter.
-_SPACING = 1.0 / 150.0
 
 # Distances between the handles of the outer and of the inner wall, as shares of the diameter, in
 # all steps but the finest ones, and in these. Beyond this number of unknowns (0.3 GB a matrix) they
@@ -69,18 +63,8 @@ _ON_EDGE = 1e-6
 # all, in the units of `FreeSurface`.
 _ROUGHNESS, _OFFSET = 0.006, 0.04
 
-# Walls, bases and widths of the roundings that are looked at, as shares of the diameter; number of
-# pixels of a look, and the blur of its backdrop, in halvings.
-_WALLS, _BASES, _ROUNDINGS = (0.008, 0.014, 0.022, 0.035, 0.055), (0.0, 0.045), (0.0, 0.012, 0.024)
-_PIXELS, _BLUR = 3000, 1
-
 # Indices of refraction of the liquids that are begun with: near those of water and of oil.
 _LIQUIDS = (1.36, 1.45)
-
-# Products of absorption and diameter, and minus logarithms of the tint of stained glass, that are
-# looked at.
-_DENSITIES = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
-_STAINS = (0.0, 0.05, 0.1, 0.2, 0.3, 0.45, 0.7)
 
 # Blurs of the first steps, which choose the contents, of the others, and of the finest ones; number
 # of pixels of a step. The finest steps are taken in rounds: before each, both walls are smoothed,
@@ -99,60 +83,6 @@ _STEPS = Steps(judges=_JUDGES, outliers=0.02, widest=0.3, gain=0.002)
 # given up; and to that of the other contents. While normals are far off, air has the advantage that
 # it bends light least.
 _HOPELESS, _WORSE = 1.25, 1.1
-
-# Margin of the grid around the surface, as a share of the diameter: three widths of the widest
-# rounding; and distance, in spacings of the grid, beyond which that to the nearest vertex of a
-# finely divided mesh is used.
-_MARGIN, _FAR = 0.075, 4.0
-
-
-def distances_to(outer: Mesh) -> Grid:
-    """Returns the distances to a closed surface on a grid, negative inside.
-
-    They are exact up to four spacings of the grid, and beyond that to within a twentieth of one.
-    """
-    size = diameter(outer.vertices)
-    spacing, margin = _SPACING * size, _MARGIN * size
-    box = Box(outer.vertices.min(axis=0) - margin, outer.vertices.max(axis=0) + margin)
-    near = sample(signed_distance(outer), box, spacing=spacing)
-    points = near.low + spacing * np.moveaxis(np.indices(near.values.shape), 0, -1)
-    fine = with_short_edges(outer, spacing)
-    away, _ = KDTree(fine.vertices[np.unique(fine.faces)]).query(points, workers=threads())
-    values = np.where(away < _FAR * spacing, near.values, np.copysign(away, near.values))
-    return near._replace(values=values)
-
-
-def inner_wall(outer: Mesh, interior: Interior, distances: Grid, *, rounding: float = 0.0) -> Mesh:
-    """Returns the surface at the depth of the wall inside the outer one, above the base.
-
-    On curved walls a rounding adds about its square times the mean curvature to the thickness. The
-    edge of the base stays sharp.
-
-    Args:
-      outer: outer surface.
-      interior: thickness of its wall and of its base.
-      distances: distances to the outer surface.
-      rounding: standard deviation of the Gaussian by which distances are smoothed, world units: the
-        inner surface of blown glass is smooth. It should not exceed 0.025 of the diameter, since
-        the grid of `distances_to` ends three times as far from the surface.
-
-    Raises:
-      ValueError: if the rounding is negative or not finite.
-      ReconstructionError: if wall and rounding leave no space inside.
-    """
-    if not (math.isfinite(rounding) and rounding >= 0.0):
-        raise ValueError(f"rounding={rounding:g} is no length. Pass 0 or more.")
-    floor = float(outer.vertices[:, 2].min()) + interior.base
-    heights = distances.low[2] + distances.spacing * np.arange(distances.values.shape[2])
-    width = rounding / distances.spacing
-    values = gaussian_filter(distances.values, width, mode="nearest") if width else distances.values
-    space = np.maximum(values + interior.wall, floor - heights)
-    if not np.any(space < 0.0):
-        raise ReconstructionError(
-            f"A wall of {interior.wall:g} above a base of {interior.base:g}, rounded by "
-            f"{rounding:g}, leaves no space inside. Pass thinner ones."
-        )
-    return find_isosurface(distances._replace(values=space))
 
 
 class FreeVessel(Vessel):
@@ -311,15 +241,14 @@ def fit_free_vessel(
     Returns:
       The best fit whose walls do not cross; `None` if there is none.
     """
-    progress(0.0, "distances to the surface")
+    progress(0.0, "looks")
     mesh = with_short_edges(mesh, 2.0 * _FINE[0] * diameter(mesh.vertices))
-    distances = distances_to(mesh)
-    some = judges.drawn(np.random.default_rng(seed), _PIXELS)
     air = Interior("air", glass=glass, glass_deviation=glass_deviation, stained=True)
     liquid = dataclasses.replace(air, contents="liquid", stained=False)
-    hypotheses = [air, *(dataclasses.replace(liquid, liquid=index) for index in _LIQUIDS)]
+    kinds = [air, *(dataclasses.replace(liquid, liquid=index) for index in _LIQUIDS)]
+    looks = best_free_looks(mesh, kinds, surface, judges, seed=seed)
     others, finest = len(_OTHERS) * _RAYS, sum(map(len, _FINEST)) * _FINEST_RAYS
-    total, done = len(hypotheses) * (len(_FIRST) * _FIRST_RAYS + others) + finest, 0
+    total, done = len(kinds) * (len(_FIRST) * _FIRST_RAYS + others) + finest, 0
 
     def fitted(vessel: FreeVessel, x: np.ndarray, blurs: tuple[int, ...], rays: int) -> _Fitted:
         nonlocal done
@@ -339,13 +268,11 @@ def fit_free_vessel(
         return _Fitted(vessel, judged(f"free vessel: {name}", vessel, fit, surface, judges))
 
     found: list[_Fitted] = []
-    for at in hypotheses:
-        vessel = _best_wall(mesh, at, distances, surface, some)
-        if vessel is not None:
-            found.append(fitted(vessel, vessel.start(), _FIRST, _FIRST_RAYS))
-    errors = [each.error() for each in found]
+    for vessel in (FreeVessel(mesh, each.inner, each.interior) for each in looks):
+        found.append(fitted(vessel, vessel.start(), _FIRST, _FIRST_RAYS))
+    errors = [each.error for each in found]
     if errors and min(errors) < _HOPELESS * rival:
-        close = [each for each in found if each.error() <= _WORSE * min(errors)]
+        close = [each for each in found if each.error <= _WORSE * min(errors)]
         found += [fitted(each.vessel, each.trial.fit.x, _OTHERS, _RAYS) for each in close]
         done = total - finest
         for blurs in _FINEST:
@@ -364,8 +291,9 @@ class _Fitted(NamedTuple):
     vessel: FreeVessel
     trial: Trial
 
+    @property
     def error(self) -> float:
-        """Returns the error of the judges."""
+        """Error of the judges."""
         return self.trial.error
 
     def surfaces_cross(self) -> bool:
@@ -373,78 +301,13 @@ class _Fitted(NamedTuple):
         return self.vessel.surfaces_cross(self.trial.fit.x)
 
 
+_error = operator.attrgetter("error")
+
+
 def _best(found: Sequence[_Fitted]) -> _Fitted | None:
     """Returns the vessel of least error whose walls do not cross."""
-    possible = (each for each in sorted(found, key=_Fitted.error) if not each.surfaces_cross())
+    possible = (each for each in sorted(found, key=_error) if not each.surfaces_cross())
     return next(possible, None)
-
-
-def _best_wall(
-    mesh: Mesh, at: Interior, distances: Grid, surface: Backdrop, pixels: Photographs
-) -> FreeVessel | None:
-    """Returns the vessel whose wall, rounding and then base suit it best, if one leaves space."""
-    size, blurred = diameter(mesh.vertices), photometry.blurred(surface, _BLUR)
-    found: list[_Look] = []
-
-    def look(wall: float, base: float, rounding: float) -> None:
-        with contextlib.suppress(ReconstructionError):
-            shape = dataclasses.replace(at, wall=wall * size, base=base * size)
-            inner = inner_wall(mesh, shape, distances, rounding=rounding * size)
-            vessel = FreeVessel(mesh, inner, shape)
-            traced = gauss_newton.traced_object(vessel.pose(vessel.start()))
-            error, coloured = _best_colour(traced, blurred, pixels, shape, size)
-            vessel.interior_at_start = coloured  # which `start` reads
-            found.append(_Look(error, wall, rounding, vessel))
-
-    for wall, rounding in itertools.product(_WALLS, _ROUNDINGS):
-        look(wall, _BASES[0], rounding)
-    if not found:
-        return None
-    best = min(found, key=lambda each: each.error)
-    for base in _BASES[1:]:
-        look(best.wall, base, best.rounding)
-    return min(found, key=lambda each: each.error).vessel
-
-
-def _best_colour(
-    traced: TracedObject, surface: Backdrop, pixels: Photographs, clear: Interior, size: float
-) -> tuple[float, Interior]:
-    """Returns the robust error of pixels with the colour that suits them best, and such contents.
-
-    It is the absorption of a liquid, or else the tint of the glass. A liquid that bends light like
-    the glass around it is seen by its absorption alone. Channels are chosen one by one, by mean
-    absolute errors. All light of a pixel is taken to be dimmed like that of its main path.
-    """
-    seen = photometry.predict(traced, surface, pixels.rays)
-    paths = photometry.sensitivities(traced, surface, pixels.rays, seen)
-    # The liquid is the second part.
-    amounts = paths.lengths[:, 1:2] if clear.filled else paths.crossings[:, :1]
-    strengths = np.array(_DENSITIES) / size if clear.filled else np.array(_STAINS)
-    dimmed = seen.linear * np.exp(-strengths[:, None, None] * amounts)
-    errors = np.abs(photometry.residuals(dimmed, pixels.rgb)).mean(axis=1)
-    best = strengths[np.argmin(errors, axis=0)]
-    seen = seen._replace(linear=seen.linear * np.exp(-amounts * best))
-    error = float(gauss_newton.robust_errors(seen, pixels.rgb).mean())
-    red, green, blue = best.tolist() if clear.filled else np.exp(-best).tolist()
-    if clear.filled:
-        return error, dataclasses.replace(clear, absorption=(red, green, blue))
-    return error, dataclasses.replace(clear, glass_tint=(red, green, blue))
-
-
-class _Look(NamedTuple):
-    """A vessel that was looked at.
-
-    Attributes:
-      error: error of the pixels.
-      wall: thickness of the wall, as a share of the diameter.
-      rounding: rounding of the inner wall, as a share of the diameter.
-      vessel: vessel with this wall.
-    """
-
-    error: float
-    wall: float
-    rounding: float
-    vessel: FreeVessel
 
 
 def _kept_below(inner: Posed, outer: Posed, depth: float) -> Posed:

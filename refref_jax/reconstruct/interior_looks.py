@@ -1,8 +1,13 @@
 """Looks at hypotheses of what is inside a vessel, through a blurred backdrop.
 
-A look predicts some 1500 pixels. Tints come first, because they remove most of the error, and are
-found without tracing light again. Hypotheses start from the thickness of the wall, what is inside
-and the level; other gaps, liquids, an open mouth and stained glass are tried for the best of them.
+A look predicts some thousand pixels. Tints come first, because they remove most of the error, and
+are found without tracing light again. Hypotheses start from the thickness of the wall, what is
+inside and the level; other gaps, liquids, an open mouth and stained glass are tried for the best of
+them.
+
+Vessels of any shape (`free_vessels`) are full of air or of liquid. Their inner wall is a level set
+of the distance from the outer one, whose edges may be rounded, above a flat base. Such a wall is
+traced once for all contents.
 
 Source: ours.
 """
@@ -10,14 +15,17 @@ Source: ours.
 import contextlib
 import dataclasses
 import math
+import operator
 from collections.abc import Sequence
+from itertools import product
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Float
+from scipy.ndimage import gaussian_filter
 
 from refref_jax.compilation import at_once
+from refref_jax.geometry.triangle_meshes import Mesh, diameter
 from refref_jax.reconstruct import ReconstructionError, gauss_newton, photometry
 from refref_jax.reconstruct.contents import (
     COARSE,
@@ -25,10 +33,15 @@ from refref_jax.reconstruct.contents import (
     Contents,
     Detail,
     Interior,
+    Layout,
+    interfaces_of,
+    media_of,
 )
 from refref_jax.reconstruct.families import Revolution
+from refref_jax.reconstruct.grids import Grid, find_isosurface
 from refref_jax.reconstruct.interiors import Vessel
-from refref_jax.reconstruct.photometry import Backdrop, Photographs
+from refref_jax.reconstruct.mesh_distance import distance_grid
+from refref_jax.reconstruct.photometry import Backdrop, Photographs, TracedObject
 
 # Errors of a channel beyond this, in sRGB, do not grow while a tint is found.
 _CAP = 0.15
@@ -39,6 +52,21 @@ _STAIN = 0.95
 # Logarithms of the tints tried, and the one that counts the crossings.
 _LOG_TINTS = np.linspace(0.05, -2.5, 103)
 _COUNTING = np.log(0.5)
+
+# Distance between the points of the grid of distances, and its margin around the surface (three
+# widths of the widest rounding), as shares of the diameter.
+_SPACING, _MARGIN = 1.0 / 150.0, 0.075
+
+
+# Walls, bases and widths of the roundings of free vessels that are looked at, as shares of the
+# diameter; number of pixels of a look, and the blur of its backdrop, in halvings.
+_WALLS, _BASES, _ROUNDINGS = (0.008, 0.014, 0.022, 0.035, 0.055), (0.0, 0.045), (0.0, 0.012, 0.024)
+_PIXELS, _BLUR = 3000, 1
+
+# Products of absorption and diameter, and minus logarithms of the tint of stained glass, that are
+# looked at.
+_DENSITIES = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
+_STAINS = (0.0, 0.05, 0.1, 0.2, 0.3, 0.45, 0.7)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -170,8 +198,7 @@ def look(
     if where.stop > where.start:
         darker = x.copy()
         darker[where] += _COUNTING
-        interfaces = jax.device_put(vessel.interfaces(darker))
-        scene = scene._replace(scene=scene.scene._replace(interfaces=interfaces))
+        scene = scene.with_interfaces(vessel.interfaces(darker))
         dark = photometry.predict(scene, surface, pixels.rays)
         crossings = np.log(np.maximum(dark.linear, 1e-9) / np.maximum(linear, 1e-9)) / _COUNTING
         change = _best_tint(linear, np.maximum(crossings, 0.0), pixels.rgb)
@@ -297,3 +324,149 @@ def _best_looks(looks: Sequence[Look], settings: SearchSettings) -> list[Look]:
     """Returns the best looks of each kind."""
     kinds = _kinds(looks)
     return [each for name in sorted(kinds) for each in kinds[name][: settings.finalists]]
+
+
+def inner_wall(outer: Mesh, interior: Interior, distances: Grid, *, rounding: float = 0.0) -> Mesh:
+    """Returns the surface at the depth of the wall inside the outer one, above the base.
+
+    On curved walls a rounding adds about its square times the mean curvature to the thickness. The
+    edge of the base stays sharp.
+
+    Args:
+      outer: outer surface.
+      interior: thickness of its wall and of its base.
+      distances: distances to the outer surface.
+      rounding: standard deviation of the Gaussian by which distances are smoothed, world units: the
+        inner surface of blown glass is smooth. It should not exceed 0.025 of the diameter, since
+        the grid should end three times as far from the surface.
+
+    Raises:
+      ValueError: if the rounding is negative or not finite.
+      ReconstructionError: if wall and rounding leave no space inside.
+    """
+    if not (math.isfinite(rounding) and rounding >= 0.0):
+        raise ValueError(f"rounding={rounding:g} is no length. Pass 0 or more.")
+    floor = float(outer.vertices[:, 2].min()) + interior.base
+    heights = distances.low[2] + distances.spacing * np.arange(distances.values.shape[2])
+    width = rounding / distances.spacing
+    values = gaussian_filter(distances.values, width, mode="nearest") if width else distances.values
+    space = np.maximum(values + interior.wall, floor - heights)
+    if not np.any(space < 0.0):
+        raise ReconstructionError(
+            f"A wall of {interior.wall:g} above a base of {interior.base:g}, rounded by "
+            f"{rounding:g}, leaves no space inside. Pass thinner ones."
+        )
+    return find_isosurface(distances._replace(values=space))
+
+
+_error = operator.attrgetter("error")
+
+
+class FreeLook(NamedTuple):
+    """A look at a vessel of any shape.
+
+    Attributes:
+      error: mean robust error of the pixels in sRGB.
+      interior: contents, with the colour that suits them best.
+      rounding: rounding of the inner wall, world units.
+      inner: inner wall.
+    """
+
+    error: float
+    interior: Interior
+    rounding: float
+    inner: Mesh
+
+
+def best_free_looks(
+    outer: Mesh,
+    kinds: Sequence[Interior],
+    surface: Backdrop,
+    pixels: Photographs,
+    *,
+    seed: int = 0,
+) -> list[FreeLook]:
+    """Looks at walls inside a surface of any shape, each with several kinds of contents.
+
+    Args:
+      outer: outer surface, closed.
+      kinds: contents and indices; walls, bases and colours are tried.
+      surface: backdrop.
+      pixels: pixels that see the vessel, of which some are looked at.
+      seed: seed of the draw.
+
+    Returns:
+      The look at each kind whose wall, rounding and then base suit it best; none if no wall leaves
+      space inside.
+    """
+    size = diameter(outer.vertices)
+    distances = distance_grid(outer, spacing=_SPACING * size, margin=_MARGIN * size)
+    blurred, some = (
+        photometry.blurred(surface, _BLUR),
+        pixels.drawn(np.random.default_rng(0), _PIXELS),
+    )
+
+    def look(
+        kinds: Sequence[Interior], wall: float, base: float, rounding: float
+    ) -> list[FreeLook]:
+        shapes = [dataclasses.replace(kind, wall=wall, base=base) for kind in kinds]
+        with contextlib.suppress(ReconstructionError):  # of a wall that leaves no space
+            inner = inner_wall(outer, shapes[0], distances, rounding=rounding)
+            scenes = _scenes(outer, inner, shapes)
+            return [
+                FreeLook(*_best_colour(traced, blurred, some, shape, size), rounding, inner)
+                for traced, shape in zip(scenes, shapes, strict=True)
+            ]
+        return []
+
+    walls = [(size * wall, size * rounding) for wall, rounding in product(_WALLS, _ROUNDINGS)]
+    looks = at_once(lambda wall: look(kinds, wall[0], size * _BASES[0], wall[1]), walls)
+    best = [min(each, key=_error) for each in zip(*filter(None, looks), strict=True)]
+    others = at_once(
+        lambda kind, each: [
+            other
+            for base in _BASES[1:]
+            for other in look([kind], each.interior.wall, size * base, each.rounding)
+        ],
+        kinds[: len(best)],
+        best,
+    )
+    return [min([each, *bases], key=_error) for each, bases in zip(best, others, strict=True)]
+
+
+def _scenes(outer: Mesh, inner: Mesh, kinds: Sequence[Interior]) -> list[TracedObject]:
+    """Returns two walls with each kind of contents; they share the tree."""
+    media = [media_of(kind, Layout(kind, 0, 0, axis=0)) for kind in kinds]
+    interfaces = [interfaces_of(each) for each in media]
+    traced = photometry.assemble(
+        np.concatenate([wall.vertices[wall.faces] for wall in (outer, inner)]),
+        np.concatenate([outer.normals, inner.normals]),
+        np.repeat(np.arange(2), [len(outer.faces), len(inner.faces)]),
+        interfaces[0],
+    )
+    return [traced.with_interfaces(each) for each in interfaces]
+
+
+def _best_colour(
+    traced: TracedObject, surface: Backdrop, pixels: Photographs, clear: Interior, size: float
+) -> tuple[float, Interior]:
+    """Returns the robust error of pixels with the colour that suits them best, and such contents.
+
+    It is the absorption of a liquid, or else the tint of the glass. A liquid that bends light like
+    the glass around it is seen by its absorption alone. Channels are chosen one by one, by mean
+    absolute errors. All light of a pixel is taken to be dimmed like that of its main path.
+    """
+    seen = photometry.predict(traced, surface, pixels.rays)
+    paths = photometry.sensitivities(traced, surface, pixels.rays, seen)
+    # The liquid is the second part.
+    amounts = paths.lengths[:, 1:2] if clear.filled else paths.crossings[:, :1]
+    strengths = np.array(_DENSITIES) / size if clear.filled else np.array(_STAINS)
+    dimmed = seen.linear * np.exp(-strengths[:, None, None] * amounts)
+    errors = np.abs(photometry.residuals(dimmed, pixels.rgb)).mean(axis=1)
+    best = strengths[np.argmin(errors, axis=0)]
+    seen = seen._replace(linear=seen.linear * np.exp(-amounts * best))
+    error = float(gauss_newton.robust_errors(seen, pixels.rgb).mean())
+    red, green, blue = best.tolist() if clear.filled else np.exp(-best).tolist()
+    if clear.filled:
+        return error, dataclasses.replace(clear, absorption=(red, green, blue))
+    return error, dataclasses.replace(clear, glass_tint=(red, green, blue))

@@ -33,7 +33,6 @@ from refref_jax.reconstruct.contents import (
     Detail,
     Interior,
     Layout,
-    Medium,
     Solid,
     interfaces_of,
     media_of,
@@ -77,9 +76,6 @@ _INWARDS = 0.7
 
 # Offsets fade into their limits over this share of them.
 _FADE = 0.1
-
-# Number of interfaces of every vessel: those without faces let all share one compiled program.
-_PARTS = 3
 
 # Fewest points of a piece of the inner wall.
 _FEWEST = 20
@@ -277,7 +273,7 @@ class Vessel:
 
     def pose(self, x: Float[np.ndarray, " unknowns"]) -> Candidate:
         """Returns the vessel at given unknowns."""
-        media = self._media(x)
+        media = media_of(self.interior(x), self.layout)
         return Candidate(
             tuple(self._surfaces(x)),
             interfaces_of(media),
@@ -288,20 +284,7 @@ class Vessel:
 
     def interfaces(self, x: Float[np.ndarray, " unknowns"]) -> Interfaces:
         """Returns the interfaces of the parts at given unknowns."""
-        return interfaces_of(self._media(x))
-
-    def _media(self, x: Float[np.ndarray, " unknowns"]) -> list[Medium]:
-        """Returns the medium of each part, and of those without faces."""
-        kinds = self._kinds()
-        of_kinds = media_of(self.interior(x), self.layout)
-        return [of_kinds[kind] for kind in kinds + ["air"] * (_PARTS - len(kinds))]
-
-    def _kinds(self) -> list[str]:
-        """Returns the material of each part."""
-        interior = self.interior_at_start
-        inside = ["liquid"] if interior.filled else []
-        air = interior.contents in ("air", "liquid and air") and not interior.mouth
-        return ["glass", *inside, *(["air"] if air else [])]
+        return interfaces_of(media_of(self.interior(x), self.layout))
 
     def _surfaces(self, x: Float[np.ndarray, " unknowns"]) -> list[Posed]:
         """Returns the surfaces of the parts, with columns for all unknowns."""
@@ -421,8 +404,9 @@ class Vessel:
         """
         found: list[Solid] = []
         media = media_of(self.interior(x), self.layout)
-        for name, part in zip(self._kinds(), self.pose(x).parts, strict=True):
-            medium, parent = media[name], 0 if found else NO_PARENT
+        parts = zip(self.interior_at_start.materials, self.pose(x).parts, strict=True)
+        for medium, (name, part) in zip(media, parts, strict=False):
+            parent = 0 if found else NO_PARENT
             found.append(
                 Solid(name, mesh_of(part), medium.index, parent, medium.tint, medium.absorption)
             )
@@ -487,11 +471,11 @@ class Vessel:
 
 def _selected(places: Sequence[slice], each: int, count: int) -> scipy.sparse.csr_array:
     """Returns the derivatives of `each` numbers of every part, which are unknowns or fixed."""
-    found = np.zeros((each * len(places), count))
-    for number, at in enumerate(places):
-        rows = np.eye(count)[at]
-        found[each * number : each * number + len(rows)] = rows
-    return scipy.sparse.csr_array(found)
+    chosen = [range(*at.indices(count)) for at in places]
+    rows = [each * part + place for part, at in enumerate(chosen) for place in range(len(at))]
+    columns = [column for at in chosen for column in at]
+    entries = (np.ones(len(rows)), (rows, columns))
+    return scipy.sparse.csr_array(entries, shape=(each * len(places), count))
 
 
 def _size(points: Curve) -> float:

@@ -19,14 +19,17 @@ Source: Baerentzen and Aanaes, Signed Distance Computation Using the Angle Weigh
 """
 
 from collections.abc import Sequence
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.ndimage import distance_transform_edt, label
 from scipy.spatial import KDTree
 from trimesh.triangles import closest_point, points_to_barycentric
 
 from refref_jax.compilation import threads
+from refref_jax.data.mesh_queries import winding_number
 from refref_jax.geometry.cameras import Cameras, image_rays
 from refref_jax.geometry.surfaces import pack_meshes
 from refref_jax.geometry.triangle_meshes import (
@@ -40,9 +43,10 @@ from refref_jax.geometry.triangle_meshes import (
     is_degenerate,
     smooth_groups,
     unit_vectors,
+    with_short_edges,
 )
 from refref_jax.reconstruct import ReconstructionError
-from refref_jax.reconstruct.grids import Box, Field, Points, Values, lattice
+from refref_jax.reconstruct.grids import Box, Field, Grid, Points, Values, lattice
 from refref_jax.reconstruct.masks import (
     REACH,
     Views,
@@ -69,6 +73,9 @@ _LONGEST_EDGE = 0.04
 
 # A point with a barycentric coordinate below this lies on the edge.
 _ON_EDGE = 1e-6
+
+# Spacings of a grid beyond which distances are those to vertices a spacing apart.
+_FAR = 4.0
 
 
 class ClosestPoints(NamedTuple):
@@ -174,6 +181,61 @@ def signed_distance(mesh: Mesh) -> Field:
         return np.where(side < 0.0, -found.distances, found.distances)
 
     return field
+
+
+def distance_grid(mesh: Mesh, *, spacing: float, margin: float) -> Grid:
+    """Returns the distances to a closed mesh on a grid, negative inside.
+
+    They are exact up to four spacings of the grid, and beyond that mostly to a twentieth of one.
+
+    Args:
+      mesh: closed mesh.
+      spacing: distance between points of the grid, world units.
+      margin: least distance of the ends of the grid from the mesh, world units.
+    """
+    low, high = mesh.vertices.min(axis=0) - margin, mesh.vertices.max(axis=0) + margin
+    cells = np.ceil((high - low) / spacing).astype(np.int64)
+    low = 0.5 * (low + high) - 0.5 * cells * spacing
+    points = low + spacing * np.moveaxis(np.indices(cells + 1), 0, -1)
+    values = _distances_to_vertices(with_short_edges(mesh, spacing), points, spacing)
+    near = values < _FAR * spacing
+    values[near] = signed_distance(mesh)(points[near])
+    # Points that are far, and connected with each other, are on the same side.
+    regions, count = label(~near)
+    _, first = np.unique(regions, return_index=True)
+    some = points.reshape(-1, 3)[first[len(first) - count :]]
+    inside = 1 + np.flatnonzero(winding_number(mesh, some) > 0.5)
+    values[np.isin(regions, inside)] *= -1.0
+    return Grid(values, low, spacing)
+
+
+def _distances_to_vertices(
+    mesh: Mesh, points: Float[np.ndarray, "x y z 3"], spacing: float
+) -> Float[np.ndarray, "x y z"]:
+    """Returns the distances of grid points to the vertices of a finely divided mesh.
+
+    A tree finds the nearest vertices of points near the mesh. It is slow for the others, which take
+    the nearest of those that belong to the nearest such point and its neighbours, or to their own
+    neighbours.
+    """
+    vertices = mesh.vertices[np.unique(mesh.faces)]
+    found, nearest = KDTree(vertices).query(
+        points, distance_upper_bound=_FAR * spacing, workers=threads()
+    )
+    vertices = np.append(vertices, np.full((1, 3), np.inf), axis=0)  # of points without any
+    far = np.isinf(found)
+    places, at, last = points[far], np.argwhere(far).T, np.reshape(far.shape, (3, 1)) - 1
+    near = distance_transform_edt(far, return_distances=False, return_indices=True)[:, far]
+    away, best = np.full(len(places), np.inf), nearest[far]
+    for around in (near, at):
+        for shift in product((-1, 0, 1), repeat=3):
+            beside = nearest[tuple(np.clip(around + np.reshape(shift, (3, 1)), 0, last))]
+            there = np.linalg.norm(places - vertices[beside], axis=-1)
+            nearer = there < away
+            away[nearer], best[nearer] = there[nearer], beside[nearer]
+        nearest[far] = best
+    found[far] = away
+    return found
 
 
 def _edge_normals(

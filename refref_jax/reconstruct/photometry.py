@@ -116,6 +116,11 @@ class TracedObject(NamedTuple):
     faces: Int[np.ndarray, " primitives"]
     division: Division
 
+    def with_interfaces(self, interfaces: Interfaces) -> "TracedObject":
+        """Returns the same surfaces between other media."""
+        scene = self.scene._replace(interfaces=jax.device_put(interfaces))
+        return self._replace(scene=scene)
+
 
 class Prediction(NamedTuple):
     """Predicted pixels, as NumPy arrays once a caller has them.

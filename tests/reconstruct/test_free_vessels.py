@@ -8,10 +8,17 @@ import numpy as np
 import pytest
 
 from refref_jax.geometry.triangle_meshes import diameter, face_normals, make_mesh, volume
-from refref_jax.reconstruct import ReconstructionError, free_vessels, gauss_newton, photometry
+from refref_jax.reconstruct import (
+    ReconstructionError,
+    free_vessels,
+    gauss_newton,
+    interior_looks,
+    photometry,
+)
 from refref_jax.reconstruct.contents import Interior
-from refref_jax.reconstruct.free_vessels import FreeVessel, distances_to, inner_wall
-from refref_jax.reconstruct.mesh_distance import signed_distance
+from refref_jax.reconstruct.free_vessels import FreeVessel
+from refref_jax.reconstruct.interior_looks import FreeLook, inner_wall
+from refref_jax.reconstruct.mesh_distance import distance_grid, signed_distance
 from refref_jax.reconstruct.model_selection import Trial
 from refref_jax.reconstruct.photometry import Photographs
 from refref_jax.reconstruct.shapes import mesh_of
@@ -30,9 +37,12 @@ def mesh():
 @pytest.fixture(scope="module")
 def inside(mesh):
     """Distances on a grid that is coarse enough for a test."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(free_vessels, "_SPACING", 3.0 * free_vessels._SPACING)
-        return distances_to(mesh)
+    return distances_to(mesh, 1.0 / 50.0)
+
+
+def distances_to(mesh, spacing):
+    size = diameter(mesh.vertices)
+    return distance_grid(mesh, spacing=spacing * size, margin=interior_looks._MARGIN * size)
 
 
 def vessel_with(mesh, interior, inside):
@@ -61,10 +71,10 @@ def test_the_inner_wall_is_at_its_distance_and_above_its_base(mesh, vessel):
     assert volume(air.mesh.vertices, air.mesh.faces) > 0.0
 
 
-def test_a_rounded_edge_is_where_a_gaussian_puts_it(monkeypatch):
-    monkeypatch.setattr(free_vessels, "_SPACING", 1.0 / 50.0)
+def test_a_rounded_edge_is_where_a_gaussian_puts_it():
+    # With planes of the grid near those of the walls: between them, it cuts sharp edges.
     box = bodies.fine_box(1.0, spacing=0.25)
-    distances = distances_to(box)
+    distances = distances_to(box, 1.0 / 60.0)
     # The mean of the larger of two normal variates is `sigma / sqrt(pi)` above theirs.
     for rounding, edge in ((0.0, 0.7), (0.12, 0.7 - 0.12 / np.sqrt(np.pi))):
         inner = inner_wall(box, Interior("air", wall=0.3), distances, rounding=rounding)
@@ -72,12 +82,11 @@ def test_a_rounded_edge_is_where_a_gaussian_puts_it(monkeypatch):
         np.testing.assert_allclose(signed_distance(inner)(on), 0.0, atol=0.01)
 
 
-def test_a_rounding_thickens_a_curved_wall(monkeypatch):
-    monkeypatch.setattr(free_vessels, "_SPACING", 1.0 / 60.0)
+def test_a_rounding_thickens_a_curved_wall():
     ball = bodies.icosphere(4)
-    rounding = free_vessels._ROUNDINGS[-1] * diameter(ball.vertices)
+    rounding = interior_looks._ROUNDINGS[-1] * diameter(ball.vertices)
     interior = Interior("air", wall=0.02)
-    inner = inner_wall(ball, interior, distances_to(ball), rounding=rounding)
+    inner = inner_wall(ball, interior, distances_to(ball, 1.0 / 60.0), rounding=rounding)
     # The mean of a distance by a Gaussian is larger by half its Laplacian times the variance.
     radii = np.linalg.norm(inner.vertices, axis=-1)
     np.testing.assert_allclose(radii + rounding**2 / radii, 0.98, atol=0.003)
@@ -103,43 +112,54 @@ def test_what_is_no_rounding_is_refused(mesh, inside, rounding):
 def test_the_wall_the_rounding_and_then_the_base_that_suit_best_are_taken(
     mesh, inside, monkeypatch, fits
 ):
+    """Each kind of contents has its own."""
     size = diameter(mesh.vertices)
-    best = np.array([free_vessels._WALLS[2], free_vessels._BASES[1], free_vessels._ROUNDINGS[1]])
+    walls, bases = interior_looks._WALLS, interior_looks._BASES
+    roundings = interior_looks._ROUNDINGS
+    best = {
+        "air": np.array([walls[2], bases[1], roundings[1]]),
+        "liquid": np.array([walls[0], bases[0], roundings[2]]),
+    }
 
     def wall(outer, interior, distances, *, rounding):
-        if not fits:
+        if not fits or interior.wall == size * walls[-1]:
             raise ReconstructionError("no space")
         return np.array([interior.wall, interior.base, rounding]) / size
 
-    class Numbers(FreeVessel):
-        """A vessel that is traced as its three numbers."""
-
-        def __init__(self, outer, inner, shape):
-            self.numbers = inner
-
-        def start(self):
-            return np.zeros(0)
-
-        def pose(self, x):
-            return self.numbers
-
-    monkeypatch.setattr(free_vessels, "inner_wall", wall)
-    monkeypatch.setattr(free_vessels, "FreeVessel", Numbers)
-    monkeypatch.setattr(gauss_newton, "traced_object", lambda candidate: candidate)
+    monkeypatch.setattr(interior_looks, "inner_wall", wall)
+    monkeypatch.setattr(interior_looks, "distance_grid", lambda mesh, **options: inside)
+    monkeypatch.setattr(interior_looks, "_scenes", lambda outer, inner, kinds: [inner] * len(kinds))
     monkeypatch.setattr(
-        free_vessels,
+        interior_looks,
         "_best_colour",
         lambda traced, surface, pixels, clear, size: (
-            float(np.abs(traced - best).mean()),
+            float(np.abs(traced - best[clear.contents]).mean()),
             dataclasses.replace(clear, tint=(0.5, 0.6, 0.7)),
         ),
     )
     world, pixels = vessels.smooth_backdrop(), black_pixels()
-    found = free_vessels._best_wall(mesh, Interior("air"), inside, world, pixels)
-    assert (found is not None) == fits
-    if fits:
-        np.testing.assert_allclose(found.numbers, best)
-        assert found.interior_at_start.tint == (0.5, 0.6, 0.7)
+    kinds = [Interior("liquid"), Interior("air")]
+    found = interior_looks.best_free_looks(mesh, kinds, world, pixels)
+    assert len(found) == 2 * fits
+    for look, kind in zip(found, kinds, strict=False):
+        at = look.interior
+        assert (at.contents, at.tint) == (kind.contents, (0.5, 0.6, 0.7))
+        numbers = np.array([at.wall, at.base, look.rounding]) / size
+        np.testing.assert_allclose(numbers, best[kind.contents])
+        np.testing.assert_allclose(look.inner, best[kind.contents])
+        assert look.error == 0.0
+
+
+def test_a_look_traces_the_light_of_the_vessel(mesh, inside):
+    surface, (rays, _) = vessels.smooth_backdrop(), lit_scenes.pixels(400, reach=0.9)
+    kinds = [Interior(each, wall=0.12, glass=1.48) for each in ("air", "liquid")]
+    inner = inner_wall(mesh, kinds[0], inside)
+    scenes = interior_looks._scenes(mesh, inner, kinds)
+    for kind, traced in zip(kinds, scenes, strict=True):
+        vessel = FreeVessel(mesh, inner, kind)
+        exact = gauss_newton.traced_object(vessel.pose(vessel.start()))
+        one, other = (photometry.predict(each, surface, rays).linear for each in (traced, exact))
+        np.testing.assert_allclose(one, other, atol=2e-3)
 
 
 def _photograph(vessel, surface, rays, views):
@@ -152,7 +172,7 @@ def test_the_wall_of_a_liquid_is_seen_by_its_absorption_alone(mesh, inside):
     """Of the same index as the glass, so that light goes straight on from one into the other."""
     surface, (rays, views) = vessels.smooth_backdrop(), lit_scenes.pixels(400, reach=0.9)
     size = diameter(mesh.vertices)
-    true = np.array([free_vessels._DENSITIES[n] for n in (4, 1, 0)]) / size
+    true = np.array([interior_looks._DENSITIES[n] for n in (4, 1, 0)]) / size
     thin = Interior("liquid", glass=1.45, liquid=1.45, wall=0.1)
     brown = vessel_with(mesh, dataclasses.replace(thin, absorption=tuple(true.tolist())), inside)
     seen, errors = _photograph(brown, surface, rays, views), []
@@ -160,7 +180,7 @@ def test_the_wall_of_a_liquid_is_seen_by_its_absorption_alone(mesh, inside):
         shape = dataclasses.replace(thin, wall=wall)
         vessel = vessel_with(mesh, shape, inside)
         traced = gauss_newton.traced_object(vessel.pose(vessel.start()))
-        error, coloured = free_vessels._best_colour(traced, surface, seen, shape, size)
+        error, coloured = interior_looks._best_colour(traced, surface, seen, shape, size)
         errors.append(error)
         if wall == thin.wall:
             np.testing.assert_allclose(coloured.absorption, true)
@@ -172,11 +192,11 @@ def test_the_wall_of_a_liquid_is_seen_by_its_absorption_alone(mesh, inside):
 def test_stained_glass_is_looked_at_with_its_tint(mesh, inside):
     surface, (rays, views) = vessels.smooth_backdrop(), lit_scenes.pixels(400, reach=0.9)
     clear = Interior("air", wall=0.12, stained=True)
-    true = np.exp([-free_vessels._STAINS[n] for n in (2, 0, 4)])
+    true = np.exp([-interior_looks._STAINS[n] for n in (2, 0, 4)])
     green = vessel_with(mesh, dataclasses.replace(clear, glass_tint=tuple(true.tolist())), inside)
     seen, vessel = _photograph(green, surface, rays, views), vessel_with(mesh, clear, inside)
     traced = gauss_newton.traced_object(vessel.pose(vessel.start()))
-    error, coloured = free_vessels._best_colour(traced, surface, seen, clear, 1.0)
+    error, coloured = interior_looks._best_colour(traced, surface, seen, clear, 1.0)
     np.testing.assert_allclose(coloured.glass_tint, true)
     assert dataclasses.replace(coloured, glass_tint=clear.glass_tint) == clear
     assert error < 0.2 * float(gauss_newton.errors_of(traced, surface, seen).mean())
@@ -338,12 +358,14 @@ def test_the_best_vessel_whose_walls_do_not_cross_is_kept(
 
     monkeypatch.setattr(free_vessels, "_FINEST", ((0,),) * rounds)
     monkeypatch.setattr(FreeVessel, "finer", finer)
-    monkeypatch.setattr(free_vessels, "distances_to", lambda mesh: inside)
-    monkeypatch.setattr(free_vessels, "_best_wall", lambda mesh, at, *_: vessel)
+    look = FreeLook(
+        0.5, vessel.interior_at_start, 0.0, mesh_of(vessel.pose(vessel.start()).parts[1])
+    )
+    monkeypatch.setattr(free_vessels, "best_free_looks", lambda *_, **options: [look] * 3)
     monkeypatch.setattr(free_vessels, "judged", judged)
     monkeypatch.setattr(gauss_newton, "fit", fit)
     monkeypatch.setattr(
-        free_vessels._Fitted, "surfaces_cross", lambda each: errors.index(each.error()) in crossing
+        free_vessels._Fitted, "surfaces_cross", lambda each: errors.index(each.error) in crossing
     )
     seen = black_pixels()
     found = free_vessels.fit_free_vessel(
@@ -385,12 +407,14 @@ def test_a_vessel_that_is_far_worse_than_another_shape_gets_no_further_steps(
     mesh, inside, monkeypatch
 ):
     monkeypatch.setattr(photometry, "_TILE", 1024)
-    small = {"_WALLS": (0.05,), "_BASES": (0.0,), "_FIRST": (1,), "_OTHERS": (0,)}
+    monkeypatch.setattr(interior_looks, "_WALLS", (0.05,))
+    monkeypatch.setattr(interior_looks, "_BASES", (0.0,))
+    small = {"_FIRST": (1,), "_OTHERS": (0,)}
     small |= {"_FINEST": ((0,),), "_FIRST_RAYS": 2000, "_RAYS": 2000, "_FINEST_RAYS": 2000}
     small |= {"_STEPS": dataclasses.replace(free_vessels._STEPS, judges=2000)}
     for name, value in small.items():
         monkeypatch.setattr(free_vessels, name, value)
-    monkeypatch.setattr(free_vessels, "distances_to", lambda mesh: inside)
+    monkeypatch.setattr(interior_looks, "distance_grid", lambda mesh, **options: inside)
     surface = vessels.smooth_backdrop()
     truth = vessel_with(mesh, Interior("air", wall=0.12, stained=True), inside)
     seen = vessels.photographs(truth, surface, reach=0.7)
