@@ -28,6 +28,7 @@ from refref_jax.data.mesh_queries import (
     diagonal,
     parts_around,
     sample_surface,
+    spread_points,
     surface_gaps,
     winding_number,
 )
@@ -57,6 +58,9 @@ _REMEDY = (
 
 # Winding number: -1 in front of an inverted closed piece, -1/2 in front of a single open sheet.
 _WOUND_BACKWARDS = -0.75
+
+# Number of places of a piece that tell whether it points inwards, and most places of a part.
+_PLACES, _MOST_PLACES = 31, 1000
 
 # Number of parts that a message names; it counts the others.
 _NAMED = 3
@@ -259,32 +263,37 @@ def lint(
 
 
 def _objects(part: MeshPart) -> list[Finding]:
-    """Reports pieces whose faces point inwards, except cavities, where that is correct."""
-    faces = _largest_faces(part)
-    # The winding number is negative in front of an inverted piece, and 0 in a cavity.
-    winding = winding_number(part, beside_faces(part, faces, 1.0))
-    inverted = int(np.sum(winding < _WOUND_BACKWARDS))
+    """Reports pieces most of whose area points inwards, except cavities, where that is correct."""
+    pieces = _pieces(part)
+    count = int(np.clip(_MOST_PLACES // max(len(pieces), 1), 1, _PLACES))
+    places = [faces[spread_points(part.vertices[part.faces[faces]], count)[0]] for faces in pieces]
+    beside = beside_faces(part, np.array(places, np.int64).ravel(), 1.0)
+    # The winding number is negative in front of an inverted piece, and 0 in a cavity. In front of a
+    # fold, where a closed surface reaches through itself, it may be anything.
+    winding = winding_number(part, beside).reshape(len(pieces), count)
+    inverted = sum(bool(np.median(each) < _WOUND_BACKWARDS) for each in winding)
     if not inverted:
         return []
     return [
         Finding(
             "error",
             part.name,
-            f"the faces of {inverted} of its {len(faces)} pieces point inwards, so inside and "
+            f"the faces of {inverted} of its {len(pieces)} pieces point inwards, so inside and "
             "outside are swapped. Flip those faces and export it again.",
         )
     ]
 
 
-def _largest_faces(part: MeshPart) -> Int[np.ndarray, " pieces"]:
-    """Returns the largest face of each connected piece."""
+def _pieces(part: MeshPart) -> list[Int[np.ndarray, " faces"]]:
+    """Returns the faces of each connected piece."""
+    if not len(part.faces):
+        return []
     first, second = part.faces[:, [0, 1, 0]].ravel(), part.faces[:, [1, 2, 2]].ravel()
     count = len(part.vertices)
     graph = coo_array((np.ones(first.size, bool), (first, second)), shape=(count, count))
-    pieces = connected_components(graph, directed=False)[1][part.faces[:, 0]]
-    a, b, c = np.moveaxis(part.vertices[part.faces], 1, 0)
-    by_area = np.argsort(np.linalg.norm(np.cross(b - a, c - a), axis=-1), kind="stable")
-    return np.array(list(dict(zip(pieces[by_area], by_area, strict=True)).values()), np.int64)
+    numbers = connected_components(graph, directed=False)[1][part.faces[:, 0]]
+    order = np.argsort(numbers, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(numbers[order])) + 1)
 
 
 def _edges(part: MeshPart) -> list[Finding]:

@@ -200,12 +200,14 @@ class FreeVessel(Vessel):
     def surfaces_cross(self, x: Float[np.ndarray, " unknowns"]) -> bool:
         """Returns whether more than 1 in 2000 vertices of the inner wall are outside the outer one.
 
-        Where a face of the outer wall is folded over, signed distances have the wrong sign, and
-        nothing keeps the few vertices beside it inside: winding numbers decide, and those few do
-        not count.
+        In a crease, a vertex that is kept below one face may come out of another, but by less than
+        it is kept below: such vertices do not count. Where a face of the outer wall is folded over,
+        signed distances have the wrong sign, and nothing keeps the few vertices beside it inside:
+        winding numbers decide, and those few do not count, either.
         """
         outer, inner = (mesh_of(wall) for wall in self._surfaces(x))
-        suspects = inner.vertices[signed_distance(outer)(inner.vertices) >= 0.0]
+        heights = signed_distance(outer)(inner.vertices)
+        suspects = inner.vertices[heights >= _THINNEST * self.size]
         some = suspects[:: math.ceil(len(suspects) / _MOST_SUSPECTS) or 1]
         outside = np.sum(winding_number(outer, some) < 0.5)
         return bool(outside * len(suspects) > _OUTSIDE * len(inner.vertices) * len(some))

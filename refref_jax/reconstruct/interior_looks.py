@@ -6,8 +6,8 @@ inside and the level; other gaps, liquids, an open mouth and stained glass are t
 them.
 
 Vessels of any shape (`free_vessels`) are full of air or of liquid. Their inner wall is a level set
-of the distance from the outer one, whose edges may be rounded, above a flat base. Such a wall is
-traced once for all contents.
+of the distance from the outer one, whose edges may be rounded, above a flat base. All contents of a
+wall share its tree.
 
 Source: ours.
 """
@@ -56,7 +56,6 @@ _COUNTING = np.log(0.5)
 # Distance between the points of the grid of distances, and its margin around the surface (three
 # widths of the widest rounding), as shares of the diameter.
 _SPACING, _MARGIN = 1.0 / 150.0, 0.075
-
 
 # Walls, bases and widths of the roundings of free vessels that are looked at, as shares of the
 # diameter; number of pixels of a look, and the blur of its backdrop, in halvings.
@@ -337,8 +336,8 @@ def inner_wall(outer: Mesh, interior: Interior, distances: Grid, *, rounding: fl
       interior: thickness of its wall and of its base.
       distances: distances to the outer surface.
       rounding: standard deviation of the Gaussian by which distances are smoothed, world units: the
-        inner surface of blown glass is smooth. It should not exceed 0.025 of the diameter, since
-        the grid should end three times as far from the surface.
+        inner surface of blown glass is smooth. It should not exceed a third of the margin of the
+        grid.
 
     Raises:
       ValueError: if the rounding is negative or not finite.
@@ -401,15 +400,13 @@ def best_free_looks(
     """
     size = diameter(outer.vertices)
     distances = distance_grid(outer, spacing=_SPACING * size, margin=_MARGIN * size)
-    blurred, some = (
-        photometry.blurred(surface, _BLUR),
-        pixels.drawn(np.random.default_rng(0), _PIXELS),
-    )
+    some = pixels.drawn(np.random.default_rng(seed), _PIXELS)
+    blurred = photometry.blurred(surface, _BLUR)
 
     def look(
-        kinds: Sequence[Interior], wall: float, base: float, rounding: float
+        some_kinds: Sequence[Interior], wall: float, base: float, rounding: float
     ) -> list[FreeLook]:
-        shapes = [dataclasses.replace(kind, wall=wall, base=base) for kind in kinds]
+        shapes = [dataclasses.replace(each, wall=wall, base=base) for each in some_kinds]
         with contextlib.suppress(ReconstructionError):  # of a wall that leaves no space
             inner = inner_wall(outer, shapes[0], distances, rounding=rounding)
             scenes = _scenes(outer, inner, shapes)

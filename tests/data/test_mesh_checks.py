@@ -79,6 +79,16 @@ def test_a_fin_on_a_closed_mesh():
     assert "3 edges" in only(_findings(part)).message
 
 
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_fold_is_not_an_inverted_mesh(turned):
+    """A vertex of its top comes out of the bottom of a box: the largest faces point inwards."""
+    part = as_part(trimesh.creation.box((2.0, 2.0, 2.0)).subdivide_to_size(0.4), "box_glass")
+    top = np.argmin(np.linalg.norm(part.vertices - [0.0, 0.0, 1.0], axis=-1))
+    part.vertices[top] = [0.0, 0.0, -10.0]
+    found = _findings(inverted(part) if turned else part)
+    assert any("point inwards" in each.message for each in found) == turned
+
+
 @pytest.mark.parametrize("part", [ball(), box(centre=(1e4, 1e4, 1e4)), shell()])
 def test_an_inverted_mesh(part):
     finding = only(_findings(inverted(part)))

@@ -49,6 +49,7 @@ def test_samples_are_along_the_bent_path_and_know_what_is_inside():
     np.testing.assert_array_equal(~found.outside, inside)
 
 
+@pytest.mark.slow
 def test_the_path_is_the_heaviest_and_some_rays_and_models_have_nothing_inside():
     # At the rim more is reflected than at the middle, but less than half.
     assert ray_samples.sample_ray(_model(), _ray(0.9)).objects.shape == (1, 2)

@@ -6,6 +6,7 @@ import functools
 import jax
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 
 from refref_jax.geometry.triangle_meshes import diameter, face_normals, make_mesh, volume
 from refref_jax.reconstruct import (
@@ -21,7 +22,7 @@ from refref_jax.reconstruct.interior_looks import FreeLook, inner_wall
 from refref_jax.reconstruct.mesh_distance import distance_grid, signed_distance
 from refref_jax.reconstruct.model_selection import Trial
 from refref_jax.reconstruct.photometry import Photographs
-from refref_jax.reconstruct.shapes import mesh_of
+from refref_jax.reconstruct.shapes import mesh_of, vertex_normals_of
 from tests.factories import bodies, lit_scenes, vessels
 from tests.laws import posed_surfaces
 
@@ -139,7 +140,7 @@ def test_the_wall_the_rounding_and_then_the_base_that_suit_best_are_taken(
     )
     world, pixels = vessels.smooth_backdrop(), black_pixels()
     kinds = [Interior("liquid"), Interior("air")]
-    found = interior_looks.best_free_looks(mesh, kinds, world, pixels)
+    found = interior_looks.best_free_looks(mesh, kinds, world, pixels, seed=3)
     assert len(found) == 2 * fits
     for look, kind in zip(found, kinds, strict=False):
         at = look.interior
@@ -176,7 +177,8 @@ def test_the_wall_of_a_liquid_is_seen_by_its_absorption_alone(mesh, inside):
     thin = Interior("liquid", glass=1.45, liquid=1.45, wall=0.1)
     brown = vessel_with(mesh, dataclasses.replace(thin, absorption=tuple(true.tolist())), inside)
     seen, errors = _photograph(brown, surface, rays, views), []
-    for wall in (0.1, 0.3, 0.5):
+    # Thick enough for three programs to be one: each is compiled for a power of two of faces.
+    for wall in (0.1, 0.25, 0.4):
         shape = dataclasses.replace(thin, wall=wall)
         vessel = vessel_with(mesh, shape, inside)
         traced = gauss_newton.traced_object(vessel.pose(vessel.start()))
@@ -209,13 +211,25 @@ def test_distances_of_wrong_sign_are_no_crossing(vessel, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("share", "most", "crosses"), [(0.0003, 1000, False), (0.01, 1000, True), (0.01, 4, True)]
+    ("share", "height", "most", "crosses"),
+    [
+        (0.0003, 1.0, 1000, False),
+        (0.01, 1.0, 1000, True),
+        (0.01, 1.0, 4, True),
+        # By less than they are kept below, as in a crease.
+        (0.01, 0.0018, 1000, False),
+        (0.01, 0.0025, 1000, True),
+    ],
 )
-def test_a_few_vertices_beside_folds_are_no_crossing(vessel, monkeypatch, share, most, crosses):
+def test_a_few_vertices_beside_folds_and_in_creases_are_no_crossing(
+    vessel, monkeypatch, share, height, most, crosses
+):
     def with_some_outside(inner, outer, depth):
-        del outer, depth
+        del depth
         some, vertices = slice(0, None, round(1.0 / share)), inner.vertices.copy()
-        vertices[some] += vessel.size * np.sign(vertices[some])
+        nearest = KDTree(outer.vertices).query(vertices[some])[1]
+        away = height * vessel.size * vertex_normals_of(outer)[nearest]
+        vertices[some] = outer.vertices[nearest] + away
         return inner._replace(vertices=vertices)
 
     monkeypatch.setattr(free_vessels, "_MOST_SUSPECTS", most)
@@ -385,8 +399,7 @@ def test_the_best_vessel_whose_walls_do_not_cross_is_kept(
 
 
 @pytest.mark.slow
-def test_light_finds_thickness_and_tint(mesh, inside, monkeypatch):
-    monkeypatch.setattr(photometry, "_TILE", 1024)
+def test_light_finds_thickness_and_tint(mesh, inside):
     surface, tint = vessels.smooth_backdrop(), (0.9, 0.97, 0.85)
     truth = Interior("air", wall=0.12, glass=1.5, stained=True, glass_tint=tint)
     seen = vessels.photographs(vessel_with(mesh, truth, inside), surface, reach=0.7)
@@ -406,7 +419,6 @@ def test_light_finds_thickness_and_tint(mesh, inside, monkeypatch):
 def test_a_vessel_that_is_far_worse_than_another_shape_gets_no_further_steps(
     mesh, inside, monkeypatch
 ):
-    monkeypatch.setattr(photometry, "_TILE", 1024)
     monkeypatch.setattr(interior_looks, "_WALLS", (0.05,))
     monkeypatch.setattr(interior_looks, "_BASES", (0.0,))
     small = {"_FIRST": (1,), "_OTHERS": (0,)}

@@ -173,6 +173,7 @@ def test_errors_say_what_to_do():
         _fit(masks[:1], alone, box=Box(behind - 0.5, behind + 0.5))
 
 
+@pytest.mark.slow
 def test_an_empty_field_is_not_handed_on(monkeypatch):
     outside = lambda params, positions, *, config: jnp.ones(len(positions))
     monkeypatch.setattr(occupancy, "field_values", outside)

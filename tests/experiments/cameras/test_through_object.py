@@ -67,6 +67,7 @@ def _left(poses, views):
 _PRIOR = Prior(0.01, 0.04)
 
 
+@pytest.mark.slow
 def test_poses_come_back(views, photos, surface, traced, monkeypatch):
     monkeypatch.setattr(through_object, "_PIXELS", 400)
     wrong, told = _wrong(views), []
