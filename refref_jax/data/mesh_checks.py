@@ -59,8 +59,9 @@ _REMEDY = (
 # Winding number: -1 in front of an inverted closed piece, -1/2 in front of a single open sheet.
 _WOUND_BACKWARDS = -0.75
 
-# Number of places of a piece that tell whether it points inwards, and most places of a part.
-_PLACES, _MOST_PLACES = 31, 1000
+# Numbers of sampled faces that decide whether a piece points inwards: least and largest, both odd;
+# and the number for all pieces of a part, unless there are too many of them.
+_LEAST_PLACES, _PLACES, _OF_A_PART = 3, 31, 1000
 
 # Number of parts that a message names; it counts the others.
 _NAMED = 3
@@ -265,7 +266,7 @@ def lint(
 def _objects(part: MeshPart) -> list[Finding]:
     """Reports pieces most of whose area points inwards, except cavities, where that is correct."""
     pieces = _pieces(part)
-    count = int(np.clip(_MOST_PLACES // max(len(pieces), 1), 1, _PLACES))
+    count = int(np.clip(_OF_A_PART // max(len(pieces), 1), _LEAST_PLACES, _PLACES)) | 1
     places = [faces[spread_points(part.vertices[part.faces[faces]], count)[0]] for faces in pieces]
     beside = beside_faces(part, np.array(places, np.int64).ravel(), 1.0)
     # The winding number is negative in front of an inverted piece, and 0 in a cavity. In front of a

@@ -52,9 +52,9 @@ _MOST = 6000
 # vertex within which depths are exact, as a multiple of it.
 _THINNEST, _NEAR = 0.002, 10.0
 
-# Largest share of the vertices of the inner wall outside the outer one; largest number of vertices
-# whose winding numbers are computed.
-_OUTSIDE, _MOST_SUSPECTS = 1.0 / 2000.0, 1000
+# Largest shares of the vertices of the inner wall that may be outside the outer one: by any height,
+# and by more than they are kept below it; largest number whose winding numbers are computed.
+_OUTSIDE, _FAR_OUTSIDE, _MOST_SUSPECTS = 1.0 / 100.0, 1.0 / 2000.0, 1000
 
 # Barycentric coordinate below which a point is on the edge of a face.
 _ON_EDGE = 1e-6
@@ -198,19 +198,22 @@ class FreeVessel(Vessel):
         return away
 
     def surfaces_cross(self, x: Float[np.ndarray, " unknowns"]) -> bool:
-        """Returns whether more than 1 in 2000 vertices of the inner wall are outside the outer one.
+        """Returns whether more than a few vertices of the inner wall are outside the outer one.
 
         In a crease, a vertex that is kept below one face may come out of another, but by less than
-        it is kept below: such vertices do not count. Where a face of the outer wall is folded over,
-        signed distances have the wrong sign, and nothing keeps the few vertices beside it inside:
-        winding numbers decide, and those few do not count, either.
+        it is kept below: 1 in 100 may. Where a face of the outer wall is folded over, signed
+        distances have the wrong sign, and nothing keeps the few vertices beside it inside: winding
+        numbers decide, and 1 in 2000 may be further outside.
         """
         outer, inner = (mesh_of(wall) for wall in self._surfaces(x))
         heights = signed_distance(outer)(inner.vertices)
-        suspects = inner.vertices[heights >= _THINNEST * self.size]
-        some = suspects[:: math.ceil(len(suspects) / _MOST_SUSPECTS) or 1]
-        outside = np.sum(winding_number(outer, some) < 0.5)
-        return bool(outside * len(suspects) > _OUTSIDE * len(inner.vertices) * len(some))
+        for least, share in ((0.0, _OUTSIDE), (_THINNEST * self.size, _FAR_OUTSIDE)):
+            suspects = inner.vertices[heights >= least]
+            some = suspects[:: math.ceil(len(suspects) / _MOST_SUSPECTS) or 1]
+            outside = np.sum(winding_number(outer, some) < 0.5)
+            if outside * len(suspects) > share * len(inner.vertices) * len(some):
+                return True
+        return False
 
 
 def fit_free_vessel(
@@ -270,7 +273,7 @@ def fit_free_vessel(
         return _Fitted(vessel, judged(f"free vessel: {name}", vessel, fit, surface, judges))
 
     found: list[_Fitted] = []
-    for vessel in (FreeVessel(mesh, each.inner, each.interior) for each in looks):
+    for vessel in [FreeVessel(mesh, each.inner, each.interior) for each in looks]:
         found.append(fitted(vessel, vessel.start(), _FIRST, _FIRST_RAYS))
     errors = [each.error for each in found]
     if errors and min(errors) < _HOPELESS * rival:

@@ -54,12 +54,9 @@ _LEAST_SCALE, _SCALE, _NARROWING, _LEAST_NOISE = 0.02, 1.5, 0.9, 0.005
 # entries from which on a Jacobian is a dense matrix.
 _DARK, _FULL = 2e-3, 0.1
 
-# Number of unknowns above which some of them tell how much errors of a view are alike.
-_MANY = 1000
-
 # Pixels where less of the light was followed, or that end where fewer pixels saw the backdrop
-# directly, do not count.
-_FOLLOWED, _SEEN = 0.7, 0.5
+# directly, do not count. Number of unknowns above which a sample estimates their covariance's size.
+_FOLLOWED, _SEEN, _MANY = 0.7, 0.5, 1000
 
 
 class Candidate(NamedTuple):
@@ -404,7 +401,6 @@ def _covariance(
     """Returns the covariance of the unknowns, with errors of a view that are alike."""
     inverse = np.linalg.inv(light.matrix + precision)
     views = light.by_view - light.by_view.mean(axis=0)
-    # Every n-th unknown has nearly the median of all.
     some = inverse[:: math.ceil(len(inverse) / _MANY)]
     scatter = np.sum((views @ some.T) ** 2, axis=0)
     independent = np.sum((some @ light.of_pixels) * some, axis=1)

@@ -1,13 +1,13 @@
 """Looks at hypotheses of what is inside a vessel, through a blurred backdrop.
 
-A look predicts some thousand pixels. Tints come first, because they remove most of the error, and
+A look predicts a few thousand pixels. Tints come first, because they remove most of the error, and
 are found without tracing light again. Hypotheses start from the thickness of the wall, what is
 inside and the level; other gaps, liquids, an open mouth and stained glass are tried for the best of
 them.
 
 Vessels of any shape (`free_vessels`) are full of air or of liquid. Their inner wall is a level set
 of the distance from the outer one, whose edges may be rounded, above a flat base. All contents of a
-wall share its tree.
+wall share one tree.
 
 Source: ours.
 """
@@ -15,9 +15,9 @@ Source: ours.
 import contextlib
 import dataclasses
 import math
-import operator
 from collections.abc import Sequence
 from itertools import product
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -61,6 +61,9 @@ _SPACING, _MARGIN = 1.0 / 150.0, 0.075
 # diameter; number of pixels of a look, and the blur of its backdrop, in halvings.
 _WALLS, _BASES, _ROUNDINGS = (0.008, 0.014, 0.022, 0.035, 0.055), (0.0, 0.045), (0.0, 0.012, 0.024)
 _PIXELS, _BLUR = 3000, 1
+
+# Least diameter of an inside, as a share of that of the vessel: less is next to solid.
+_LEAST_INSIDE = 0.15
 
 # Products of absorption and diameter, and minus logarithms of the tint of stained glass, that are
 # looked at.
@@ -358,9 +361,6 @@ def inner_wall(outer: Mesh, interior: Interior, distances: Grid, *, rounding: fl
     return find_isosurface(distances._replace(values=space))
 
 
-_error = operator.attrgetter("error")
-
-
 class FreeLook(NamedTuple):
     """A look at a vessel of any shape.
 
@@ -403,32 +403,35 @@ def best_free_looks(
     some = pixels.drawn(np.random.default_rng(seed), _PIXELS)
     blurred = photometry.blurred(surface, _BLUR)
 
-    def look(
+    def looks_inside(
         some_kinds: Sequence[Interior], wall: float, base: float, rounding: float
     ) -> list[FreeLook]:
         shapes = [dataclasses.replace(each, wall=wall, base=base) for each in some_kinds]
-        with contextlib.suppress(ReconstructionError):  # of a wall that leaves no space
+        try:
             inner = inner_wall(outer, shapes[0], distances, rounding=rounding)
-            scenes = _scenes(outer, inner, shapes)
-            return [
-                FreeLook(*_best_colour(traced, blurred, some, shape, size), rounding, inner)
-                for traced, shape in zip(scenes, shapes, strict=True)
-            ]
-        return []
+        except ReconstructionError:  # it leaves no space
+            return []
+        if diameter(inner.vertices) < _LEAST_INSIDE * size:
+            return []
+        return [
+            FreeLook(*_best_colour(traced, blurred, some, shape, size), rounding, inner)
+            for traced, shape in zip(_scenes(outer, inner, shapes), shapes, strict=True)
+        ]
 
+    error = attrgetter("error")
     walls = [(size * wall, size * rounding) for wall, rounding in product(_WALLS, _ROUNDINGS)]
-    looks = at_once(lambda wall: look(kinds, wall[0], size * _BASES[0], wall[1]), walls)
-    best = [min(each, key=_error) for each in zip(*filter(None, looks), strict=True)]
+    looks = at_once(lambda wall: looks_inside(kinds, wall[0], size * _BASES[0], wall[1]), walls)
+    best = [min(each, key=error) for each in zip(*filter(None, looks), strict=True)]
     others = at_once(
         lambda kind, each: [
             other
             for base in _BASES[1:]
-            for other in look([kind], each.interior.wall, size * base, each.rounding)
+            for other in looks_inside([kind], each.interior.wall, size * base, each.rounding)
         ],
         kinds[: len(best)],
         best,
     )
-    return [min([each, *bases], key=_error) for each, bases in zip(best, others, strict=True)]
+    return [min([each, *bases], key=error) for each, bases in zip(best, others, strict=True)]
 
 
 def _scenes(outer: Mesh, inner: Mesh, kinds: Sequence[Interior]) -> list[TracedObject]:

@@ -186,10 +186,11 @@ def signed_distance(mesh: Mesh) -> Field:
 def distance_grid(mesh: Mesh, *, spacing: float, margin: float) -> Grid:
     """Returns the distances to a closed mesh on a grid, negative inside.
 
-    They are exact up to four spacings of the grid, and beyond that mostly to a twentieth of one.
+    They are exact up to four spacings of the grid, and beyond that mostly to within a twentieth
+    of one.
 
     Args:
-      mesh: closed mesh.
+      mesh: closed mesh, whose faces point outwards.
       spacing: distance between points of the grid, world units.
       margin: least distance of the ends of the grid from the mesh, world units.
     """
@@ -222,7 +223,9 @@ def _distances_to_vertices(
     found, nearest = KDTree(vertices).query(
         points, distance_upper_bound=_FAR * spacing, workers=threads()
     )
-    vertices = np.append(vertices, np.full((1, 3), np.inf), axis=0)  # of points without any
+    vertices = np.append(
+        vertices, np.full((1, 3), np.inf), axis=0
+    )  # for points without a nearest vertex
     far = np.isinf(found)
     places, at, last = points[far], np.argwhere(far).T, np.reshape(far.shape, (3, 1)) - 1
     near = distance_transform_edt(far, return_distances=False, return_indices=True)[:, far]

@@ -85,6 +85,12 @@ def test_a_fold_is_not_an_inverted_mesh(turned):
     part = as_part(trimesh.creation.box((2.0, 2.0, 2.0)).subdivide_to_size(0.4), "box_glass")
     top = np.argmin(np.linalg.norm(part.vertices - [0.0, 0.0, 1.0], axis=-1))
     part.vertices[top] = [0.0, 0.0, -10.0]
+    # In the middle of all faces: one place of a piece alone would be there.
+    folded = np.any(part.faces == top, axis=1)
+    others = part.faces[~folded]
+    middle = len(others) // 2
+    faces = np.concatenate([others[:middle], part.faces[folded], others[middle:]])
+    part = part._replace(faces=faces)
     found = _findings(inverted(part) if turned else part)
     assert any("point inwards" in each.message for each in found) == turned
 

@@ -117,7 +117,6 @@ def test_the_number_of_faces_does_not_depend_on_the_level(body):
 @pytest.mark.slow
 @pytest.mark.parametrize("deviation", [0.0, 0.03])
 def test_a_given_index_is_kept(body, surface, small_tiles, deviation):
-    del small_tiles
     seen = vessels.photographs(Vessel(body, Interior("air", wall=0.15), _SMALL), surface)
     start = Interior("air", wall=0.15, glass=1.45, glass_deviation=deviation)
     vessel = Vessel(body, start, _SMALL)
@@ -256,16 +255,8 @@ def surface():
 
 
 @pytest.fixture(scope="module")
-def small_tiles():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(photometry, "_TILE", 1024)
-        yield
-
-
-@pytest.fixture(scope="module")
-def photographs(body, surface, small_tiles):
+def photographs(body, surface):
     """Pixels of the flask, without noise."""
-    del small_tiles
     return vessels.photographs(Vessel(body, _FLASK, _SMALL), surface)
 
 

@@ -290,6 +290,19 @@ def test_sensitivities_are_central_differences_of_predictions(world, ball, kind,
     assert slopes @ expected / (slopes @ slopes) == pytest.approx(1.0, abs=off)
 
 
+def test_a_sample_of_the_unknowns_tells_how_much_errors_of_a_view_are_alike(monkeypatch):
+    count, random = 60, np.random.default_rng(0)
+    by_view, rows = 8.0 * random.normal(size=(30, count)), random.normal(size=(200, count))
+    pixels = rows.T @ rows
+    light = gauss_newton.Equations(pixels, by_view.sum(axis=0), by_view, pixels)
+    prior = np.eye(count)
+    all_of_them = gauss_newton._covariance(light, prior)
+    monkeypatch.setattr(gauss_newton, "_MANY", 7)
+    some = gauss_newton._covariance(light, prior)
+    np.testing.assert_allclose(some, all_of_them, rtol=0.3)
+    assert np.all(np.diag(some) > 2.0 * np.diag(np.linalg.inv(pixels + prior)))
+
+
 @pytest.mark.parametrize("absorption", [0.0, 0.5, 1e6])
 def test_lengths_of_main_paths_are_chords_and_finite_in_the_dark(world, ball, absorption):
     part = ball.pose(ball.start())
