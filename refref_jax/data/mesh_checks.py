@@ -15,8 +15,6 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from refref_jax.choices import RuleName
 from refref_jax.data import SceneError
@@ -34,7 +32,7 @@ from refref_jax.data.mesh_queries import (
 )
 from refref_jax.data.meshes import MeshPart
 from refref_jax.geometry.cameras import Cameras
-from refref_jax.geometry.triangle_meshes import is_degenerate
+from refref_jax.geometry.triangle_meshes import is_degenerate, pieces
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.optics.media import EMPTY_SLOT, INDEX_OF_AIR
 
@@ -265,21 +263,23 @@ def lint(
 
 def _objects(part: MeshPart) -> list[Finding]:
     """Reports pieces most of whose area points inwards, except cavities, where that is correct."""
-    pieces = _pieces(part)
-    count = int(np.clip(_OF_A_PART // max(len(pieces), 1), _LEAST_PLACES, _PLACES)) | 1
-    places = [faces[spread_points(part.vertices[part.faces[faces]], count)[0]] for faces in pieces]
-    beside = beside_faces(part, np.array(places, np.int64).ravel(), 1.0)
+    connected = _pieces(part)
+    if not connected:
+        return []
+    count = int(np.clip(_OF_A_PART // len(connected), _LEAST_PLACES, _PLACES)) | 1
+    some = [faces[spread_points(part.vertices[part.faces[faces]], count)[0]] for faces in connected]
+    beside = beside_faces(part, np.concatenate(some), 1.0)
     # The winding number is negative in front of an inverted piece, and 0 in a cavity. In front of a
     # fold, where a closed surface reaches through itself, it may be anything.
-    winding = winding_number(part, beside).reshape(len(pieces), count)
-    inverted = sum(bool(np.median(each) < _WOUND_BACKWARDS) for each in winding)
+    winding = winding_number(part, beside).reshape(len(connected), count)
+    inverted = int(np.sum(np.median(winding, axis=1) < _WOUND_BACKWARDS))
     if not inverted:
         return []
     return [
         Finding(
             "error",
             part.name,
-            f"the faces of {inverted} of its {len(pieces)} pieces point inwards, so inside and "
+            f"the faces of {inverted} of its {len(connected)} pieces point inwards, so inside and "
             "outside are swapped. Flip those faces and export it again.",
         )
     ]
@@ -287,14 +287,10 @@ def _objects(part: MeshPart) -> list[Finding]:
 
 def _pieces(part: MeshPart) -> list[Int[np.ndarray, " faces"]]:
     """Returns the faces of each connected piece."""
-    if not len(part.faces):
-        return []
-    first, second = part.faces[:, [0, 1, 0]].ravel(), part.faces[:, [1, 2, 2]].ravel()
-    count = len(part.vertices)
-    graph = coo_array((np.ones(first.size, bool), (first, second)), shape=(count, count))
-    numbers = connected_components(graph, directed=False)[1][part.faces[:, 0]]
+    numbers = pieces(part.faces, len(part.vertices))[part.faces[:, 0]]
     order = np.argsort(numbers, kind="stable")
-    return np.split(order, np.flatnonzero(np.diff(numbers[order])) + 1)
+    found = np.split(order, np.flatnonzero(np.diff(numbers[order])) + 1)
+    return [faces for faces in found if len(faces)]
 
 
 def _edges(part: MeshPart) -> list[Finding]:

@@ -25,7 +25,7 @@ from jaxtyping import Float
 from scipy.ndimage import gaussian_filter
 
 from refref_jax.compilation import at_once
-from refref_jax.geometry.triangle_meshes import Mesh, diameter
+from refref_jax.geometry.triangle_meshes import Mesh, diameter, keep_faces, pieces
 from refref_jax.reconstruct import ReconstructionError, gauss_newton, photometry
 from refref_jax.reconstruct.contents import (
     COARSE,
@@ -62,8 +62,9 @@ _SPACING, _MARGIN = 1.0 / 150.0, 0.075
 _WALLS, _BASES, _ROUNDINGS = (0.008, 0.014, 0.022, 0.035, 0.055), (0.0, 0.045), (0.0, 0.012, 0.024)
 _PIXELS, _BLUR = 3000, 1
 
-# Least diameter of an inside, as a share of that of the vessel: less is next to solid.
-_LEAST_INSIDE = 0.15
+# Least diameters of a piece of an inside, and of all of it, as shares of the vessel's: smaller
+# pieces have no handle of their own, and what has less space inside is next to solid.
+_LEAST_PIECE, _LEAST_INSIDE = 0.05, 0.15
 
 # Products of absorption and diameter, and minus logarithms of the tint of stained glass, that are
 # looked at.
@@ -411,7 +412,8 @@ def best_free_looks(
             inner = inner_wall(outer, shapes[0], distances, rounding=rounding)
         except ReconstructionError:  # it leaves no space
             return []
-        if diameter(inner.vertices) < _LEAST_INSIDE * size:
+        inner = _without_specks(inner, _LEAST_PIECE * size)
+        if not len(inner.faces) or diameter(inner.vertices) < _LEAST_INSIDE * size:
             return []
         return [
             FreeLook(*_best_colour(traced, blurred, some, shape, size), rounding, inner)
@@ -432,6 +434,16 @@ def best_free_looks(
         best,
     )
     return [min([each, *bases], key=error) for each, bases in zip(best, others, strict=True)]
+
+
+def _without_specks(mesh: Mesh, least: float) -> Mesh:
+    """Returns a mesh without connected pieces whose diameter is below a length."""
+    piece = pieces(mesh.faces, len(mesh.vertices))
+    low, high = (np.full((piece.max() + 1, 3), sign * np.inf) for sign in (1.0, -1.0))
+    np.minimum.at(low, piece, mesh.vertices)
+    np.maximum.at(high, piece, mesh.vertices)
+    large = np.linalg.norm(high - low, axis=-1) >= least
+    return mesh if large.all() else keep_faces(mesh, large[piece[mesh.faces[:, 0]]])
 
 
 def _scenes(outer: Mesh, inner: Mesh, kinds: Sequence[Interior]) -> list[TracedObject]:

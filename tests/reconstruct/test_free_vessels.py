@@ -161,6 +161,17 @@ def test_the_wall_the_rounding_and_then_the_base_that_suit_best_are_taken(
         assert look.error == np.abs(look.inner.normals - best[kind.contents]).mean()
 
 
+def test_specks_of_an_inside_are_left_out(mesh):
+    specks = [bodies.icosphere(2, radius=radius, centre=(3.0, 0.0, 0.0)) for radius in (0.02, 0.2)]
+    both = bodies.joined(specks[0], mesh, specks[1])
+    found = interior_looks._without_specks(both, 0.1)
+    assert len(found.faces) == len(mesh.faces) + len(specks[1].faces)
+    expected = np.concatenate([mesh.vertices, specks[1].vertices])
+    np.testing.assert_array_equal(np.unique(found.vertices, axis=0), np.unique(expected, axis=0))
+    assert interior_looks._without_specks(mesh, 0.1) is mesh
+    assert not len(interior_looks._without_specks(specks[0], 0.1).faces)
+
+
 def test_a_look_traces_the_light_of_the_vessel(mesh, inside):
     surface, (rays, _) = vessels.smooth_backdrop(), lit_scenes.pixels(400, reach=0.9)
     kinds = [Interior(each, wall=0.12, glass=1.48) for each in ("air", "liquid")]
