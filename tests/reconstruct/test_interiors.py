@@ -116,7 +116,7 @@ def test_the_number_of_faces_does_not_depend_on_the_level(body):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("deviation", [0.0, 0.03])
-def test_a_given_index_is_kept(body, surface, small_tiles, deviation):
+def test_a_given_index_is_kept(body, surface, deviation):
     seen = vessels.photographs(Vessel(body, Interior("air", wall=0.15), _SMALL), surface)
     start = Interior("air", wall=0.15, glass=1.45, glass_deviation=deviation)
     vessel = Vessel(body, start, _SMALL)
@@ -416,8 +416,7 @@ def test_levels_are_looked_at_again_with_both_mouths(body, surface, photographs,
 
 
 @pytest.mark.slow
-def test_bases_lids_and_punts_are_looked_at(body, surface, small_tiles):
-    del small_tiles
+def test_bases_lids_and_punts_are_looked_at(body, surface):
     truth = Interior("air", wall=0.08, base=0.72, lid=0.3, punt=0.08)
     seen = vessels.photographs(Vessel(body, truth, _SMALL), surface, reach=1.4)
     vessel = Vessel(body, Interior("air", wall=0.08), _SMALL)
@@ -440,8 +439,7 @@ def test_looks_leave_out_walls_that_fill_the_vessel(body, surface, photographs):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("tint", [(1.0, 1.0, 1.0), (0.9, 0.97, 0.8)])
-def test_stained_glass_is_looked_at_where_it_pays(body, surface, small_tiles, tint):
-    del small_tiles
+def test_stained_glass_is_looked_at_where_it_pays(body, surface, tint):
     truth = Interior("air", wall=0.13, stained=True, glass_tint=tint)
     seen = vessels.photographs(Vessel(body, truth, _SMALL), surface)
     settings = SearchSettings((0.05,), 1, (0.04,), (1.36,), mouths=(False,), blur=1, pixels=800)
@@ -453,8 +451,7 @@ def test_stained_glass_is_looked_at_where_it_pays(body, surface, small_tiles, ti
 
 
 @pytest.mark.slow
-def test_looks_tell_coloured_solid_glass_from_a_vessel(body, surface, small_tiles):
-    del small_tiles
+def test_looks_tell_coloured_solid_glass_from_a_vessel(body, surface):
     solid = Interior("none", stained=True, glass_tint=(0.7, 0.9, 0.8))
     seen = vessels.photographs(Vessel(body, solid, _SMALL), surface)
     settings = SearchSettings((0.05,), 1, (0.04,), (1.36,), mouths=(False,), blur=1, pixels=800)
@@ -463,8 +460,7 @@ def test_looks_tell_coloured_solid_glass_from_a_vessel(body, surface, small_tile
 
 
 @pytest.mark.slow
-def test_the_finest_steps_find_a_ridge_and_are_reported(body, surface, small_tiles, monkeypatch):
-    del small_tiles
+def test_the_finest_steps_find_a_ridge_and_are_reported(body, surface, monkeypatch):
     monkeypatch.setattr(interior_search, "_VARIANTS", ())
     fine, detail = body.with_knots(80), Detail(outer=48, ridges=60, inner=64, azimuths=48)
     truth = Vessel(fine, _FLASK, detail)
