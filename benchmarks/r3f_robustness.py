@@ -129,7 +129,7 @@ def _begun_off(scene: Path, out: Path, found: records.Reconstruction) -> list[st
     masks = object_source.read_mesh(out, dataclasses.replace(found, light=None))
     seen = light_stage.read(scene, seed=0)
     known = dataclasses.replace(found.index, index=found.index.index + _OFF)
-    revolved = light_stage.look_at_ends(scene, masks, surface, seen, seed=0)
+    revolved = light_stage.look_at_opaque_parts(scene, masks, surface, seen, seed=0)
     trials = light_stage.fit(scene, masks, known, surface, seen, revolved, seed=0)
     chosen = light_stage.choose(scene, masks, trials)[1]
     name = f"index begun {_OFF:g} off"

@@ -402,7 +402,7 @@ def _draw(
     path: Path, scene: Path, before: Trial, after: Trial, surface: Backdrop, seen: Seen
 ) -> None:
     names = ("as given", "aligned")
-    nothing = light_stage.RevolvedObject(None).ends_seen
+    nothing = light_stage.RevolvedObject(None).opaque_seen
     light_figures.draw(path, scene, seen.split, before, after, surface, None, nothing, names=names)
 
 

@@ -8,7 +8,7 @@ index (`reconstruct.shape_from_refraction`). If the object is a body of revoluti
 glass explains its pixels, the stage looks at what may be inside instead of a free surface
 (`reconstruct.interior_search`). In a solid that was chosen, it looks for bubbles of air
 (`reconstruct.bubble_search`). Vessels and solids with bubbles become several parts. Opaque caps and
-feet of bodies of revolution are parts of their own (`reconstruct.opaque_ends`). Where nothing else
+feet of bodies of revolution are parts of their own (`reconstruct.opaque_parts`). Where nothing else
 explains the pixels, a vessel of any shape is fitted (`reconstruct.free_vessels`). Pixels that
 were not fitted judge: those of the validation views, or of every eighth training view where these
 have no masks. Where the background is a field, and where light explains nothing better, the surface
@@ -41,7 +41,7 @@ from refref_jax.reconstruct import (
     interior_looks,
     interior_search,
     model_selection,
-    opaque_ends,
+    opaque_parts,
     shape_from_refraction,
 )
 from refref_jax.reconstruct.bubbles import ObjectWithBubbles
@@ -52,7 +52,7 @@ from refref_jax.reconstruct.interior_search import Finding
 from refref_jax.reconstruct.interiors import Vessel
 from refref_jax.reconstruct.masks import Views
 from refref_jax.reconstruct.model_selection import Trial
-from refref_jax.reconstruct.opaque_ends import OpaqueEnd
+from refref_jax.reconstruct.opaque_parts import OpaquePart
 from refref_jax.reconstruct.outlines import Outlines, fit_profile
 from refref_jax.reconstruct.photometry import Backdrop, Photographs
 from refref_jax.reconstruct.refinement import objection
@@ -108,17 +108,17 @@ class RevolvedObject(NamedTuple):
     Attributes:
       outer: its outer surface; `None` if it is no such body, or a ring, which has no ends and holds
         nothing.
-      ends: its opaque ends.
+      opaque: its opaque parts.
     """
 
     outer: Revolution | None
-    ends: tuple[OpaqueEnd, ...] = ()
+    opaque: tuple[OpaquePart, ...] = ()
 
-    def ends_seen(self, rays: Rays) -> Float[np.ndarray, "rays 3"]:
+    def opaque_seen(self, rays: Rays) -> Float[np.ndarray, "rays 3"]:
         """Returns the linear RGB of the opaque end that each ray meets first, NaN without any."""
-        if self.outer is None or not self.ends:
+        if self.outer is None or not self.opaque:
             return np.full((rays.radii.size, 3), np.nan)
-        return opaque_ends.colours_seen(self.outer, self.ends, rays)
+        return opaque_parts.colours_seen(self.outer, self.opaque, rays)
 
 
 def run(
@@ -146,10 +146,10 @@ def run(
         reason = "the background is a field, not a surface at a known place"
         return LightFacts(kept=False, index=known.index, remark=reason)
     seen = read(scene, seed=seed, gains=gains)
-    revolved = look_at_ends(scene, mesh, surface, seen, seed=seed)
+    revolved = look_at_opaque_parts(scene, mesh, surface, seen, seed=seed)
     trials = fit(scene, mesh, known, surface, seen, revolved, seed=seed)
     masks, chosen, remark = choose(scene, mesh, trials)
-    if revolved.ends and chosen is not masks and not isinstance(chosen.model, Vessel):
+    if revolved.opaque and chosen is not masks and not isinstance(chosen.model, Vessel):
         chosen, remark = masks, "an end is opaque, and what remains is no vessel"
     kept = chosen is not masks
     written = revolved if isinstance(chosen.model, Vessel) else RevolvedObject(None)
@@ -157,13 +157,13 @@ def run(
     parts: tuple[PartFacts, ...] = ()
     with atomic_files.written_folder(target.parent) as folder:
         if kept and isinstance(chosen.model, Vessel | ObjectWithBubbles):
-            solids = [*chosen.model.solids(chosen.fit.x), *_solid_ends(written)]
+            solids = [*chosen.model.solids(chosen.fit.x), *_opaque_solids(written)]
             parts = _write_parts(folder, target.stem, solids, known)
         elif kept:
             meshes.write_mesh(folder / target.name, *chosen.mesh)
         views = (scene, seen.split)
         light_figures.draw(
-            folder / FIGURE, *views, masks, chosen, surface, deviations, written.ends_seen
+            folder / FIGURE, *views, masks, chosen, surface, deviations, written.opaque_seen
         )
     unknown = 1.0 if deviations is None else float(np.mean(deviations > _UNKNOWN))
     estimated = known.source == "estimated"
@@ -239,11 +239,11 @@ def _write_parts(
     return tuple(facts)
 
 
-def _solid_ends(revolved: RevolvedObject) -> list[Solid]:
+def _opaque_solids(revolved: RevolvedObject) -> list[Solid]:
     """Returns the opaque ends as parts."""
     found, outer = [], revolved.outer
-    for end in revolved.ends if outer is not None else ():
-        mesh = opaque_ends.mesh_of_end(outer, end)
+    for end in revolved.opaque if outer is not None else ():
+        mesh = opaque_parts.mesh_of_part(outer, end)
         name = "cap" if end.is_cap(outer) else "foot"
         found.append(Solid(name, mesh, INDEX_OF_AIR, NO_PARENT, CLEAR, radiance=end.colour))
     return found
@@ -276,7 +276,7 @@ def read_views(scene: Path) -> Views:
     return Views(masks, frames.cameras)
 
 
-def look_at_ends(
+def look_at_opaque_parts(
     scene: Path, mesh: Mesh, surface: Backdrop, seen: Seen, *, seed: int
 ) -> RevolvedObject:
     """Returns the object as a body of revolution with its opaque ends, unless it is a ring."""
@@ -288,7 +288,7 @@ def look_at_ends(
         relief = measure_relief(mesh, outer.axis)
         outer = fit_profile(outer, read_views(scene), relief=relief, seed=seed)
         bar.show(1, "looking for opaque ends")
-        ends = opaque_ends.find_opaque_ends(outer, surface, seen.fitted, seed=seed)
+        ends = opaque_parts.find_opaque_parts(outer, surface, seen.fitted, seed=seed)
         bar.show(2, "done")
     return RevolvedObject(outer, ends)
 
@@ -314,11 +314,11 @@ def fit(
       known: index of refraction.
       surface: backdrop.
       seen: pixels to fit, and those that judge.
-      revolved: the object as a body of revolution (`look_at_ends`).
+      revolved: the object as a body of revolution (`look_at_opaque_parts`).
       seed: random seed.
     """
     views = read_views(scene)
-    outer, seen = _between_ends(revolved, seen)
+    outer, seen = _clear_part(revolved, seen)
     options = {} if known.source == "estimated" else {"deviation": 0.0}
     with ProgressBar("light", 100) as bar:
         trials = shape_from_refraction.fit_shapes(
@@ -336,7 +336,7 @@ def fit(
     outlines = Outlines(views, seed=seed)
     if _may_be_vessel(outer, trials):
         trials = (*trials, *_vessels(outer, known, surface, seen, outlines, seed=seed))
-    if _is_unexplained(trials) and not revolved.ends:
+    if _is_unexplained(trials) and not revolved.opaque:
         rival = min(trial.error for trial in trials)
         trials = (*trials, *_free_vessels(mesh, known, surface, seen, outlines, rival, seed=seed))
     masks, chosen, _ = choose(scene, mesh, trials)
@@ -346,15 +346,17 @@ def fit(
     return (*trials, *_with_bubbles(chosen, surface, seen, outlines, seed=seed))
 
 
-def _between_ends(revolved: RevolvedObject, seen: Seen) -> tuple[Revolution | None, Seen]:
+def _clear_part(revolved: RevolvedObject, seen: Seen) -> tuple[Revolution | None, Seen]:
     """Returns the clear part of a body, and the pixels that do not see its opaque ends."""
-    if revolved.outer is None or not revolved.ends:
+    if revolved.outer is None or not revolved.opaque:
         return revolved.outer, seen
     fitted, judges = (
-        each.chosen(np.flatnonzero(~opaque_ends.seen_by(revolved.outer, revolved.ends, each)))
+        each.chosen(np.flatnonzero(~opaque_parts.seen_by(revolved.outer, revolved.opaque, each)))
         for each in (seen.fitted, seen.judges)
     )
-    return opaque_ends.clear_part(revolved.outer, revolved.ends), Seen(fitted, judges, seen.split)
+    return opaque_parts.clear_part(revolved.outer, revolved.opaque), Seen(
+        fitted, judges, seen.split
+    )
 
 
 def _with_bubbles(

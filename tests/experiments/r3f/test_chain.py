@@ -26,14 +26,14 @@ from experiments.r3f import (
 from experiments.r3f.records import ReconstructionConfig
 from refref_jax.data import meshes, scene_folder
 from refref_jax.geometry.triangle_meshes import corner_normals, make_mesh
-from refref_jax.reconstruct import opaque_ends, refinement
+from refref_jax.reconstruct import opaque_parts, refinement
 from refref_jax.reconstruct.bubbles import Bubble, ObjectWithBubbles
 from refref_jax.reconstruct.contents import COARSE, Interior
 from refref_jax.reconstruct.gauss_newton import Fit
 from refref_jax.reconstruct.interiors import Vessel
 from refref_jax.reconstruct.mesh_distance import compare_meshes
 from refref_jax.reconstruct.model_selection import Trial
-from refref_jax.reconstruct.opaque_ends import OpaqueEnd
+from refref_jax.reconstruct.opaque_parts import OpaquePart
 from refref_jax.reconstruct.refinement import Refinement
 from refref_jax.reconstruct.refractive_index import Descent, IndexEstimate
 from refref_jax.reconstruct.shape_from_refraction import SingleObject
@@ -318,7 +318,7 @@ def _stub_light(monkeypatch, *, after, growth=1.001, index=1.51):
 
     monkeypatch.setattr(light_stage, "fit", fit)
     monkeypatch.setattr(light_figures, "draw", lambda path, *_: path.write_bytes(b"figure"))
-    monkeypatch.setattr(light_stage, "look_at_ends", lambda *_, **options: _SHAPELESS)
+    monkeypatch.setattr(light_stage, "look_at_opaque_parts", lambda *_, **options: _SHAPELESS)
     monkeypatch.setattr(index_stage, "has_backdrop", lambda *args, **options: True)
     monkeypatch.setattr(index_stage, "learn_backdrop", lambda *_, **options: "surface")
     return called
@@ -423,7 +423,7 @@ def test_bubbles_come_with_the_shape_that_is_chosen(scene, monkeypatch, tmp_path
     bubbly = Trial("ball with 1 bubble", model, fit, 0.0299 + _VIEWS)
     monkeypatch.setattr(light_stage, "fit", lambda *_, **options: (masks, solid, bubbly))
     monkeypatch.setattr(light_figures, "draw", lambda path, *_: path.write_bytes(b"figure"))
-    monkeypatch.setattr(light_stage, "look_at_ends", lambda *_, **options: _SHAPELESS)
+    monkeypatch.setattr(light_stage, "look_at_opaque_parts", lambda *_, **options: _SHAPELESS)
     known, target = records.IndexFacts("estimated", 1.5, 0.01, 0.04), tmp_path / "a" / "b_glass.ply"
     facts = light_stage.run(scene, mesh, known, "surface", target, seed=0)
     if growth > 1.0:  # the shape was rejected, and its bubbles with it
@@ -441,11 +441,11 @@ def test_bubbles_come_with_the_shape_that_is_chosen(scene, monkeypatch, tmp_path
 def test_opaque_ends_are_parts_of_vessels_alone(scene, monkeypatch, tmp_path, is_vessel):
     outer = vessels.bottle()
     top, colour = float(outer.points[:, 1].max()), (0.02, 0.05, 0.3)
-    cap = OpaqueEnd(top - 0.5, top, colour)
+    cap = OpaquePart(top - 0.5, top, colour)
     whole = mesh_of(outer.pose(outer.start()))
     masks = _trial("masks", whole, 1.35, 0.1 + _VIEWS)
     if is_vessel:
-        model = Vessel(opaque_ends.clear_part(outer, (cap,)), Interior("air", wall=0.1), COARSE)
+        model = Vessel(opaque_parts.clear_part(outer, (cap,)), Interior("air", wall=0.1), COARSE)
     else:
         model = SingleObject(FixedShape(whole), 1.5)
     x = model.start()
@@ -453,7 +453,9 @@ def test_opaque_ends_are_parts_of_vessels_alone(scene, monkeypatch, tmp_path, is
     painted = []
     monkeypatch.setattr(light_stage, "fit", lambda *_, **options: (masks, chosen))
     monkeypatch.setattr(
-        light_stage, "look_at_ends", lambda *_, **options: light_stage.RevolvedObject(outer, (cap,))
+        light_stage,
+        "look_at_opaque_parts",
+        lambda *_, **options: light_stage.RevolvedObject(outer, (cap,)),
     )
 
     def draw(path, *options):
@@ -481,7 +483,7 @@ def test_a_ring_has_no_ends_and_holds_nothing(monkeypatch):
     ring = trimesh.creation.torus(1.0, 0.4, major_sections=64, minor_sections=32)
     mesh = make_mesh(ring.vertices, ring.faces)
     monkeypatch.setattr(light_stage, "fit_profile", None)  # would raise
-    found = light_stage.look_at_ends(Path("nowhere"), mesh, None, None, seed=0)
+    found = light_stage.look_at_opaque_parts(Path("nowhere"), mesh, None, None, seed=0)
     assert found.outer is None and found.ends == ()
 
 

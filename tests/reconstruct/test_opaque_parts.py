@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from refref_jax.geometry.triangle_meshes import face_vectors, is_watertight, volume
-from refref_jax.reconstruct import opaque_ends, photometry, walls
+from refref_jax.reconstruct import opaque_parts, photometry, walls
 from refref_jax.reconstruct.families import Revolution
 from refref_jax.reconstruct.mesh_distance import signed_distance
-from refref_jax.reconstruct.opaque_ends import OpaqueEnd, clear_part, find_opaque_ends
+from refref_jax.reconstruct.opaque_parts import OpaquePart, clear_part, find_opaque_parts
 from refref_jax.reconstruct.photometry import Backdrop
 from refref_jax.reconstruct.revolution import Profile
 from refref_jax.reconstruct.shape_from_refraction import SingleObject
@@ -19,12 +19,12 @@ _BLUE, _ROW = (0.02, 0.05, 0.3), 2.6 / 128
 
 def _cap(body, height, colour=_BLUE):
     top = float(body.points[:, 1].max())
-    return OpaqueEnd(top - height, top, colour)
+    return OpaquePart(top - height, top, colour)
 
 
 def _foot(body, height, colour=_BLUE):
     bottom = float(body.points[:, 1].min())
-    return OpaqueEnd(bottom, bottom + height, colour)
+    return OpaquePart(bottom, bottom + height, colour)
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ def clear(body, surface):
 
 def _painted(body, pixels, *ends):
     """The same pixels where ends are opaque, with some noise."""
-    colours = opaque_ends.colours_seen(body, ends, pixels.rays)
+    colours = opaque_parts.colours_seen(body, ends, pixels.rays)
     seen = ~np.isnan(colours[:, 0])
     rgb = pixels.rgb.copy()
     rgb[seen] = photometry.encode(colours[seen])
@@ -57,7 +57,7 @@ def _painted(body, pixels, *ends):
 @pytest.mark.slow
 def test_a_cap_is_found_where_it_is(body, surface, clear):
     cap = _cap(body, 0.55)
-    (found,) = find_opaque_ends(body, surface, _painted(body, clear, cap))
+    (found,) = find_opaque_parts(body, surface, _painted(body, clear, cap))
     assert found.low == pytest.approx(cap.low, abs=2.0 * _ROW)
     assert found.high == pytest.approx(cap.high, abs=0.01)
     assert found.colour == pytest.approx(_BLUE, abs=0.01)
@@ -66,7 +66,7 @@ def test_a_cap_is_found_where_it_is(body, surface, clear):
 @pytest.mark.slow
 def test_a_cap_and_a_foot_are_two_ends(body, surface, clear):
     ends = (_foot(body, 0.3, (0.5, 0.2, 0.1)), _cap(body, 0.4))
-    found = find_opaque_ends(body, surface, _painted(body, clear, *ends))
+    found = find_opaque_parts(body, surface, _painted(body, clear, *ends))
     for end, true in zip(found, ends, strict=True):
         assert (end.low, end.high) == pytest.approx((true.low, true.high), abs=2.0 * _ROW)
         assert end.colour == pytest.approx(true.colour, abs=0.02)
@@ -74,7 +74,7 @@ def test_a_cap_and_a_foot_are_two_ends(body, surface, clear):
 
 @pytest.mark.slow
 def test_clear_glass_has_no_opaque_ends(body, surface, clear):
-    assert find_opaque_ends(body, surface, _painted(body, clear)) == ()
+    assert find_opaque_parts(body, surface, _painted(body, clear)) == ()
 
 
 @pytest.mark.slow
@@ -83,21 +83,21 @@ def test_in_front_of_a_plain_wall_nothing_is_told(body, surface, clear):
         surface.domain, tuple(0.0 * mip + 0.4 for mip in surface.mips), surface.coverage
     )
     same = clear._replace(rgb=np.full_like(clear.rgb, 0.66))
-    assert find_opaque_ends(body, grey, same) == ()
+    assert find_opaque_parts(body, grey, same) == ()
 
 
 @pytest.mark.slow
 def test_what_is_opaque_as_a_whole_has_no_ends(body, surface, clear):
-    whole = OpaqueEnd(-4.0, 4.0, _BLUE)
-    assert find_opaque_ends(body, surface, _painted(body, clear, whole)) == ()
+    whole = OpaquePart(-4.0, 4.0, _BLUE)
+    assert find_opaque_parts(body, surface, _painted(body, clear, whole)) == ()
     ring = Revolution(body.axis, Profile(revolved.ring(), closed=True), 2.0)
-    assert find_opaque_ends(ring, surface, clear) == ()
+    assert find_opaque_parts(ring, surface, clear) == ()
 
 
 @pytest.mark.slow
 def test_two_ends_that_leave_little_are_none(body, surface, clear):
     ends = (_foot(body, 1.2), _cap(body, 1.2))
-    assert find_opaque_ends(body, surface, _painted(body, clear, *ends)) == ()
+    assert find_opaque_parts(body, surface, _painted(body, clear, *ends)) == ()
 
 
 def test_a_high_cap_is_no_foot(body):
@@ -109,7 +109,7 @@ def test_a_high_cap_is_no_foot(body):
 @pytest.mark.slow
 def test_few_pixels_tell_nothing(body, surface, clear):
     some = _painted(body, clear, _cap(body, 0.55)).chosen(np.arange(40))
-    assert find_opaque_ends(body, surface, some) == ()
+    assert find_opaque_parts(body, surface, some) == ()
 
 
 @pytest.mark.slow
@@ -119,7 +119,7 @@ def test_glass_and_ends_are_apart_and_fill_the_body(body):
     found = (glass.points[:, 1].min(), glass.points[:, 1].max())
     assert found == pytest.approx((ends[0].high, ends[1].low), abs=0.02)
     whole, middle = (mesh_of(each.pose(each.start())) for each in (body, glass))
-    meshes = [opaque_ends.mesh_of_end(body, end) for end in ends]
+    meshes = [opaque_parts.mesh_of_part(body, end) for end in ends]
     inside = signed_distance(middle)
     for mesh in meshes:
         assert volume(mesh.vertices, mesh.faces) > 0.0
@@ -131,10 +131,10 @@ def test_glass_and_ends_are_apart_and_fill_the_body(body):
 @pytest.mark.slow
 def test_pixels_of_ends_are_left_out(body, clear):
     end = _cap(body, 0.55)
-    seen = opaque_ends.seen_by(body, (end,), clear)
-    painted = ~np.isnan(opaque_ends.colours_seen(body, (end,), clear.rays)[:, 0])
+    seen = opaque_parts.seen_by(body, (end,), clear)
+    painted = ~np.isnan(opaque_parts.colours_seen(body, (end,), clear.rays)[:, 0])
     assert np.all(seen[painted])
-    assert not opaque_ends.seen_by(body, (OpaqueEnd(5.0, 6.0, _BLUE),), clear)[painted].any()
+    assert not opaque_parts.seen_by(body, (OpaquePart(5.0, 6.0, _BLUE),), clear)[painted].any()
 
 
 def test_without_ends_all_of_the_body_remains(body):
@@ -147,7 +147,7 @@ def test_a_foot_may_be_hollow(body):
     foot = _foot(hollow, 0.3)
     glass = clear_part(hollow, (foot,))
     assert glass.points[:, 1].min() == pytest.approx(foot.high, abs=0.02)
-    mesh = opaque_ends.mesh_of_end(hollow, foot)
+    mesh = opaque_parts.mesh_of_part(hollow, foot)
     areas = np.linalg.norm(face_vectors(mesh.vertices, mesh.faces), axis=-1)
     assert is_watertight(mesh.faces) and areas.min() > 0.0
     heights = (mesh.vertices - body.axis.point) @ body.axis.frame[:, 2]

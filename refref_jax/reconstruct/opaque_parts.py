@@ -57,7 +57,7 @@ _APART = 0.002
 _POINTS, _AZIMUTHS, _PROFILE_POINTS = 96, 96, 600
 
 
-class OpaqueEnd(NamedTuple):
+class OpaquePart(NamedTuple):
     """The opaque part of a body below or above a height.
 
     Attributes:
@@ -75,9 +75,9 @@ class OpaqueEnd(NamedTuple):
         return self.low + self.high > sum(_extent(outer))
 
 
-def find_opaque_ends(
+def find_opaque_parts(
     outer: Revolution, surface: Backdrop, pixels: Photographs, *, seed: int = 0
-) -> tuple[OpaqueEnd, ...]:
+) -> tuple[OpaquePart, ...]:
     """Finds opaque caps and feet.
 
     Args:
@@ -106,7 +106,7 @@ def find_opaque_ends(
         inside = (rows >= first) & (rows < last)
         linear = image_files.srgb_to_linear(some.rgb[inside].astype(np.float64)).mean(axis=0)
         low, high = (bottom + (top - bottom) * row / _ROWS for row in (first, last))
-        found.append(OpaqueEnd(low, high, (float(linear[0]), float(linear[1]), float(linear[2]))))
+        found.append(OpaquePart(low, high, (float(linear[0]), float(linear[1]), float(linear[2]))))
     return tuple(found)
 
 
@@ -172,7 +172,7 @@ def _runs_at_ends(
 
 
 def seen_by(
-    outer: Revolution, ends: Sequence[OpaqueEnd], pixels: Photographs
+    outer: Revolution, ends: Sequence[OpaquePart], pixels: Photographs
 ) -> Bool[np.ndarray, " rays"]:
     """Returns which pixels see an opaque end first, or miss the surface."""
     heights, (low, high) = _first_points(outer, pixels.rays)[:, 2], _extent(outer)
@@ -184,7 +184,7 @@ def seen_by(
 
 
 def colours_seen(
-    outer: Revolution, ends: Sequence[OpaqueEnd], rays: Rays
+    outer: Revolution, ends: Sequence[OpaquePart], rays: Rays
 ) -> Float[np.ndarray, "rays 3"]:
     """Returns the linear RGB of the opaque end that each ray meets first, NaN without any."""
     heights = _first_points(outer, rays)[:, 2]
@@ -194,7 +194,7 @@ def colours_seen(
     return found
 
 
-def clear_part(outer: Revolution, ends: Sequence[OpaqueEnd]) -> Revolution:
+def clear_part(outer: Revolution, ends: Sequence[OpaquePart]) -> Revolution:
     """Returns the body between its opaque ends, with flat ends where they were."""
     points, (low, high) = outer.points, _limits(outer, ends)
     kept, (bottom, top) = points, _extent(outer)
@@ -212,7 +212,7 @@ def clear_part(outer: Revolution, ends: Sequence[OpaqueEnd]) -> Revolution:
     return Revolution(outer.axis, profile, size, outer.relief, knots=outer.knots)
 
 
-def _limits(outer: Revolution, ends: Sequence[OpaqueEnd]) -> tuple[float, float]:
+def _limits(outer: Revolution, ends: Sequence[OpaquePart]) -> tuple[float, float]:
     """Returns the heights between which the body is clear."""
     low, high = _extent(outer)
     apart = _APART * (high - low)
@@ -232,7 +232,7 @@ def _at_height(
     return (one + share * (other - one))[None]
 
 
-def mesh_of_end(outer: Revolution, end: OpaqueEnd) -> Mesh:
+def mesh_of_part(outer: Revolution, end: OpaquePart) -> Mesh:
     """Returns an opaque end as a closed mesh; hollows in the flat faces of the body are filled."""
     lowest, highest = (find(outer.points[:, 1]) for find in (np.argmin, np.argmax))
     points = outer.points[lowest : highest + 1]
