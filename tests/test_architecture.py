@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks import planted_bugs
+from tests.laws import syntax
 
 _ROOT = Path(__file__).parents[1]
 _PACKAGE = _ROOT / "refref_jax"
@@ -74,7 +75,7 @@ def _name(path):
 
 def _imports(path):
     """Yields the dotted names that a module imports."""
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in syntax.nodes(path):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -83,13 +84,13 @@ def _imports(path):
 
 def _late_imports(path):
     """Yields the names of modules that a command imports when they are first used."""
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in syntax.nodes(path):
         if isinstance(node, ast.Call) and ast.unparse(node.func) == "late":
             yield ast.literal_eval(node.args[0])
 
 
 def _functions(path):
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in syntax.nodes(path):
         if isinstance(node, ast.FunctionDef):
             yield node
 
@@ -189,7 +190,7 @@ def test_numpy_and_jax_never_meet_in_one_function(path):
 @pytest.mark.parametrize("path", _MODULES, ids=_name)
 def test_only_the_rim_compiles(path):
     if _name(path) not in _MAY_JIT:
-        named = [node for node in ast.walk(ast.parse(path.read_text())) if _is_jit(node)]
+        named = [node for node in syntax.nodes(path) if _is_jit(node)]
         assert not named and "jax.jit" not in _imports(path)
 
 

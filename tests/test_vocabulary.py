@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.laws import syntax
+
 _ROOT = Path(__file__).parents[1]
 _PAGES = [
     *(_ROOT / name for name in ("README.md", "BUILD_NOTES.md", "CONTRIBUTING.md")),
@@ -90,9 +92,9 @@ _BANNED_NAMES = {
 _OF_THEIR_OWN = ("experiments/dataset/objects", "experiments/dataset/textures")
 
 
-def _public_names(tree):
+def _public_names(path):
     """Yields public functions, classes, their arguments and fields."""
-    for node in ast.walk(tree):
+    for node in syntax.nodes(path):
         if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
             yield node.name
             if isinstance(node, ast.FunctionDef):
@@ -102,10 +104,10 @@ def _public_names(tree):
                 yield from (each.target.id for each in fields)
 
 
-def _messages(tree):
+def _messages(path):
     """Yields texts of several words that are not docstrings: messages, help, printed lines."""
-    statements = {id(each.value) for each in ast.walk(tree) if isinstance(each, ast.Expr)}
-    for node in ast.walk(tree):
+    statements = {id(each.value) for each in syntax.nodes(path) if isinstance(each, ast.Expr)}
+    for node in syntax.nodes(path):
         text = node.value if isinstance(node, ast.Constant) else None
         if isinstance(text, str) and " " in text and id(node) not in statements:
             yield text
@@ -113,7 +115,7 @@ def _messages(tree):
 
 def _docstrings(path):
     kinds = ast.Module | ast.FunctionDef | ast.ClassDef
-    nodes = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, kinds)]
+    nodes = [node for node in syntax.nodes(path) if isinstance(node, kinds)]
     return [text for node in nodes if (text := ast.get_docstring(node))]
 
 
@@ -128,7 +130,7 @@ def test_docstrings_use_the_fields_words(path):
 
 @pytest.mark.parametrize("path", _MODULES, ids=lambda path: path.relative_to(_ROOT).as_posix())
 def test_messages_use_the_fields_words(path):
-    assert [word for text in _messages(ast.parse(path.read_text())) for word in _found(text)] == []
+    assert [word for text in _messages(path) for word in _found(text)] == []
 
 
 def test_public_names_are_the_fields():
@@ -136,7 +138,7 @@ def test_public_names_are_the_fields():
         f"{path.relative_to(_ROOT)}: {name} ({_BANNED_NAMES[word]})"
         for path in _MODULES
         if not path.relative_to(_ROOT).as_posix().startswith(_OF_THEIR_OWN)
-        for name in _public_names(ast.parse(path.read_text()))
+        for name in _public_names(path)
         for word in map(str.lower, re.findall(r"[A-Za-z][a-z]*", name))
         if word in _BANNED_NAMES
     }
@@ -163,6 +165,6 @@ def test_modules_say_what_they_do():
     questions = [
         path.relative_to(_ROOT).as_posix()
         for path in _MODULES
-        if _QUESTION.match(ast.get_docstring(ast.parse(path.read_text())) or "")
+        if _QUESTION.match(ast.get_docstring(syntax.nodes(path)[0]) or "")
     ]
     assert len(questions) < _MOST_QUESTIONS, questions

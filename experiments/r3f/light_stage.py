@@ -7,12 +7,12 @@ Families of shapes and a free surface are fitted to pixels of the training views
 index (`reconstruct.shape_from_refraction`). If the object is a body of revolution, and no solid
 glass explains its pixels, the stage looks at what may be inside instead of a free surface
 (`reconstruct.interior_search`). In a solid that was chosen, it looks for bubbles of air
-(`reconstruct.bubble_search`). Vessels and solids with bubbles become several parts. Opaque caps and
-feet of bodies of revolution are parts of their own (`reconstruct.opaque_parts`). Where nothing else
-explains the pixels, a vessel of any shape is fitted (`reconstruct.free_vessels`). Pixels that
-were not fitted judge: those of the validation views, or of every eighth training view where these
-have no masks. Where the background is a field, and where light explains nothing better, the surface
-stays as it is.
+(`reconstruct.bubble_search`). Vessels and solids with bubbles become several parts. Opaque caps,
+feet and labels of bodies of revolution are parts of their own (`reconstruct.opaque_parts`). Where
+nothing else explains the pixels, a vessel of any shape is fitted (`reconstruct.free_vessels`).
+Pixels that were not fitted judge: those of the validation views, or of every eighth training view
+where these have no masks. Where the background is a field, and where light explains nothing better,
+the surface stays as it is.
 """
 
 import functools
@@ -115,7 +115,7 @@ class RevolvedObject(NamedTuple):
     opaque: tuple[OpaquePart, ...] = ()
 
     def opaque_seen(self, rays: Rays) -> Float[np.ndarray, "rays 3"]:
-        """Returns the linear RGB of the opaque end that each ray meets first, NaN without any."""
+        """Returns the linear RGB of the opaque part that each ray meets first, NaN without any."""
         if self.outer is None or not self.opaque:
             return np.full((rays.radii.size, 3), np.nan)
         return opaque_parts.colours_seen(self.outer, self.opaque, rays)
@@ -150,14 +150,14 @@ def run(
     trials = fit(scene, mesh, known, surface, seen, revolved, seed=seed)
     masks, chosen, remark = choose(scene, mesh, trials)
     if revolved.opaque and chosen is not masks and not isinstance(chosen.model, Vessel):
-        chosen, remark = masks, "an end is opaque, and what remains is no vessel"
+        chosen, remark = masks, "a part is opaque, and what remains is no vessel"
     kept = chosen is not masks
     written = revolved if isinstance(chosen.model, Vessel) else RevolvedObject(None)
     deviations = model_selection.normal_deviations(chosen) if kept else None
     parts: tuple[PartFacts, ...] = ()
     with atomic_files.written_folder(target.parent) as folder:
         if kept and isinstance(chosen.model, Vessel | ObjectWithBubbles):
-            solids = [*chosen.model.solids(chosen.fit.x), *_opaque_solids(written)]
+            solids = [*chosen.model.solids(chosen.fit.x), *_opaque_solids(written, chosen)]
             parts = _write_parts(folder, target.stem, solids, known)
         elif kept:
             meshes.write_mesh(folder / target.name, *chosen.mesh)
@@ -239,13 +239,18 @@ def _write_parts(
     return tuple(facts)
 
 
-def _opaque_solids(revolved: RevolvedObject) -> list[Solid]:
-    """Returns the opaque ends as parts."""
-    found, outer = [], revolved.outer
-    for end in revolved.opaque if outer is not None else ():
-        mesh = opaque_parts.mesh_of_part(outer, end)
-        name = "cap" if end.is_cap(outer) else "foot"
-        found.append(Solid(name, mesh, INDEX_OF_AIR, NO_PARENT, CLEAR, radiance=end.colour))
+def _opaque_solids(revolved: RevolvedObject, chosen: Trial) -> list[Solid]:
+    """Returns the opaque parts of a vessel that was chosen."""
+    found: list[Solid] = []
+    outer, vessel = revolved.outer, chosen.model
+    for part in revolved.opaque if outer is not None and isinstance(vessel, Vessel) else ():
+        name: str = part.kind(outer)
+        if name == "label":
+            mesh = opaque_parts.mesh_of_label(vessel, chosen.fit.x, part)
+            name += str(sum(each.name.startswith(name) for each in found) or "")
+        else:
+            mesh = opaque_parts.mesh_of_part(outer, part)
+        found.append(Solid(name, mesh, INDEX_OF_AIR, NO_PARENT, CLEAR, radiance=part.colour))
     return found
 
 
@@ -279,7 +284,7 @@ def read_views(scene: Path) -> Views:
 def look_at_opaque_parts(
     scene: Path, mesh: Mesh, surface: Backdrop, seen: Seen, *, seed: int
 ) -> RevolvedObject:
-    """Returns the object as a body of revolution with its opaque ends, unless it is a ring."""
+    """Returns the object as a body of revolution with its opaque parts, unless it is a ring."""
     outer = families.fit_revolution(mesh, furthest=_FURTHEST)
     if outer is None or outer.closed:
         return RevolvedObject(None)
@@ -287,10 +292,10 @@ def look_at_opaque_parts(
         bar.show(0, "fitting to the outlines")
         relief = measure_relief(mesh, outer.axis)
         outer = fit_profile(outer, read_views(scene), relief=relief, seed=seed)
-        bar.show(1, "looking for opaque ends")
-        ends = opaque_parts.find_opaque_parts(outer, surface, seen.fitted, seed=seed)
+        bar.show(1, "looking for opaque parts")
+        opaque = opaque_parts.find_opaque_parts(outer, surface, seen.fitted, seed=seed)
         bar.show(2, "done")
-    return RevolvedObject(outer, ends)
+    return RevolvedObject(outer, opaque)
 
 
 def fit(
@@ -306,7 +311,7 @@ def fit(
     """Fits vessels, or else all shapes that come near the mesh; the mesh itself comes first.
 
     If bubbles are found in the shape that is chosen, it comes once more with them, as the last.
-    Pixels that see an opaque end do not count.
+    Pixels that see an opaque part do not count.
 
     Args:
       scene: folder of the scene.
@@ -347,7 +352,7 @@ def fit(
 
 
 def _clear_part(revolved: RevolvedObject, seen: Seen) -> tuple[Revolution | None, Seen]:
-    """Returns the clear part of a body, and the pixels that do not see its opaque ends."""
+    """Returns the clear part of a body, and the pixels that do not see its opaque parts."""
     if revolved.outer is None or not revolved.opaque:
         return revolved.outer, seen
     fitted, judges = (

@@ -288,9 +288,9 @@ class Vessel:
 
     def _surfaces(self, x: Float[np.ndarray, " unknowns"]) -> list[Posed]:
         """Returns the surfaces of the parts, with columns for all unknowns."""
-        return [self._posed(outline, x) for outline in self._pieces(x)]
+        return [self.posed(outline, x) for outline in self._pieces(x)]
 
-    def _posed(self, outline: Outline, x: Float[np.ndarray, " unknowns"]) -> Posed:
+    def posed(self, outline: Outline, x: Float[np.ndarray, " unknowns"]) -> Posed:
         """Returns a profile turned around the axis, with columns for all unknowns."""
         shift, azimuths, layout = np.append(x[:4], 0.0), self.detail.azimuths, self.layout
         connected = lathe(outline.poles, outline.segments, outline.ends, azimuths)

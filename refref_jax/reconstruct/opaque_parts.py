@@ -1,20 +1,21 @@
-"""Opaque caps and feet of bodies of revolution, found by the colours of their pixels.
+"""Opaque caps, feet and labels of bodies of revolution, found by the colours of their pixels.
 
 A place on a matt surface has the same colour in every photograph. Through glass, each photograph
 shows another part of the backdrop there. So pixels are sorted by the place where they first meet
 the surface; where their colours vary far less than those of the backdrop behind them, the surface
-is opaque. Only its two ends are looked at: `clear_part` returns the glass between them.
+is opaque. `clear_part` returns the glass between a foot and a cap; a label is a ring around it.
 
-Labels and rings around glass are not found, and shiny plastic is not opaque. A very dark liquid at
-an end may pass as opaque.
+Labels that do not go all the way round are not found, and shiny plastic is not opaque. A very dark
+liquid may pass as opaque.
 
 Source: ours; photo-consistency is that of Seitz and Dyer: Photorealistic Scene Reconstruction by
 Voxel Coloring (1997).
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -26,8 +27,9 @@ from refref_jax.geometry.triangle_meshes import Mesh
 from refref_jax.optics.media import INDEX_OF_AIR
 from refref_jax.reconstruct import gauss_newton, photometry, walls
 from refref_jax.reconstruct.families import Revolution, place
+from refref_jax.reconstruct.interiors import Vessel
 from refref_jax.reconstruct.photometry import Backdrop, Photographs
-from refref_jax.reconstruct.revolution import Profile, even, lathe, profile_normals
+from refref_jax.reconstruct.revolution import Profile, even, lathe, profile_normals, turn_right
 from refref_jax.reconstruct.shape_from_refraction import SingleObject
 from refref_jax.reconstruct.shapes import FixedShape, mesh_of
 from refref_jax.reconstruct.turned import Turned
@@ -40,25 +42,30 @@ _ROWS, _SECTORS, _PIXELS = 128, 12, 32_768
 # Fewest pixels of a place, and fewest independent numbers of a row.
 _MIN_PIXELS, _MIN_FREEDOM = 4, 60
 
-# Variation of the colours of opaque places, as a share of that of the backdrop behind them, and the
-# least variation of a backdrop that tells anything, sRGB.
-_MAX_VARIATION, _MIN_BACKDROP_VARIATION = 0.35, 0.04
+# Variation of the colours of opaque ends and of labels, as a share of that of the backdrop behind
+# them, and the least variation of a backdrop that tells anything, sRGB. Stained glass has down to
+# 0.33 in places, a label 0.13.
+_MAX_VARIATION, _MAX_OF_LABEL, _MIN_BACKDROP_VARIATION = 0.35, 0.25, 0.04
 
-# Least share of the rows that an end takes, and largest share of all ends together.
-_MIN_SHARE, _MAX_SHARE = 0.03, 0.7
+# Least share of the rows that an end and a label take, and largest share of all parts together.
+_MIN_SHARE, _MIN_LABEL, _MAX_SHARE = 0.03, 0.05, 0.7
 
-# Rows beside an end whose pixels count as its own.
+# Rows beside a part whose pixels count as its own.
 _MARGIN = 1.5
 
-# Distance between the glass and an opaque end, as a share of the height.
-_APART = 0.002
+# Distance between the glass and an opaque part, and thickness of a label, as shares of the height.
+_APART, _THICKNESS = 0.002, 0.004
 
-# Points of the profile of an end, half-planes of its mesh, and points of the glass's profile.
+# Points of the profile of a part and half-planes of its mesh, and points of the glass's profile.
 _POINTS, _AZIMUTHS, _PROFILE_POINTS = 96, 96, 600
 
 
+Kind = Literal["cap", "foot", "label"]
+"""Where an opaque part is."""
+
+
 class OpaquePart(NamedTuple):
-    """The opaque part of a body below or above a height.
+    """The opaque part of a body between two heights: a foot, a cap, or a label around it.
 
     Attributes:
       low: lower end of the part, along the axis from its point, world units.
@@ -70,15 +77,19 @@ class OpaquePart(NamedTuple):
     high: float
     colour: Colour
 
-    def is_cap(self, outer: Revolution) -> bool:
-        """Returns whether it is the upper end of a body, not the lower one."""
-        return self.low + self.high > sum(_extent(outer))
+    def kind(self, outer: Revolution) -> Kind:
+        """Returns whether it is the upper end of a body, the lower one, or around it."""
+        bottom, top = _extent(outer)
+        almost = 0.5 * (top - bottom) / _ROWS
+        if self.high >= top - almost:
+            return "cap"
+        return "foot" if self.low <= bottom + almost else "label"
 
 
 def find_opaque_parts(
     outer: Revolution, surface: Backdrop, pixels: Photographs, *, seed: int = 0
 ) -> tuple[OpaquePart, ...]:
-    """Finds opaque caps and feet.
+    """Finds opaque caps, feet and labels.
 
     Args:
       outer: outer surface of the whole body.
@@ -87,8 +98,8 @@ def find_opaque_parts(
       seed: seed of the draw.
 
     Returns:
-      The opaque ends, the lower one first; none if the backdrop is too plain to tell, or most of
-      the body is opaque.
+      The opaque parts, from the lowest to the highest; none if the backdrop is too plain to tell,
+      or most of the body is opaque.
     """
     if outer.closed:
         return ()
@@ -100,9 +111,8 @@ def find_opaque_parts(
     seen, known = _variations(cells, some.rgb)
     shown, _ = _variations(cells, straight)
     known &= shown > _MIN_BACKDROP_VARIATION
-    opaque = known & (seen < _MAX_VARIATION * shown)
     found, (bottom, top) = [], _extent(outer)
-    for first, last in _runs_at_ends(opaque, known):
+    for first, last in _opaque_rows(np.where(known, seen / np.maximum(shown, 1e-9), np.nan)):
         inside = (rows >= first) & (rows < last)
         linear = image_files.srgb_to_linear(some.rgb[inside].astype(np.float64)).mean(axis=0)
         low, high = (bottom + (top - bottom) * row / _ROWS for row in (first, last))
@@ -154,49 +164,88 @@ def _variations(
     return np.sqrt(squares / np.maximum(freedom, 1.0)), freedom > _MIN_FREEDOM
 
 
-def _runs_at_ends(
-    opaque: Bool[np.ndarray, " rows"], known: Bool[np.ndarray, " rows"]
-) -> list[tuple[int, int]]:
-    """Returns the first row and the one after the last of opaque rows at both ends.
+def _opaque_rows(ratios: Float[np.ndarray, " rows"]) -> list[tuple[int, int]]:
+    """Returns the first row and the one after the last of each opaque part.
+
+    Args:
+      ratios: variation of the colours of each row, as a share of that of the backdrop behind it;
+        NaN where it is not known.
+    """
+    count = len(ratios)
+    ends = [run for run in _runs(ratios, _MAX_VARIATION) if run[0] == 0 or run[1] == count]
+    ends = [(first, last) for first, last in ends if last - first >= _MIN_SHARE * count]
+    labels = [
+        (first, last)
+        for first, last in _runs(ratios, _MAX_OF_LABEL)
+        if last - first >= _MIN_LABEL * count and first > 0 and last < count
+    ]
+    labels = [run for run in labels if all(run[1] <= a or run[0] >= b for a, b in ends)]
+    found = sorted(ends + labels)
+    return found if sum(last - first for first, last in found) <= _MAX_SHARE * count else []
+
+
+def _runs(ratios: Float[np.ndarray, " rows"], most: float) -> list[tuple[int, int]]:
+    """Returns the first row and the one after the last of each run of rows that vary little.
 
     Rows of which nothing is known do not end a run, but nor do they begin one.
     """
-    count, clear, dark = len(opaque), np.flatnonzero(known & ~opaque), np.flatnonzero(opaque)
-    if not len(clear) or not len(dark):
+    rows = np.flatnonzero(~np.isnan(ratios))
+    if not len(rows):
         return []
-    below, above = dark[dark < clear[0]], dark[dark > clear[-1]]
-    runs = [(0, int(below[-1]) + 1)] if len(below) else []
-    runs += [(int(above[0]), count)] if len(above) else []
-    runs = [run for run in runs if run[1] - run[0] >= _MIN_SHARE * count]
-    return runs if sum(last - first for first, last in runs) <= _MAX_SHARE * count else []
+    still = ratios[rows] < most
+    groups = np.split(rows, np.flatnonzero(np.diff(still.astype(int))) + 1)
+    groups = [group for group in groups if ratios[group[0]] < most]
+    return [
+        (
+            0 if group[0] == rows[0] else int(group[0]),
+            len(ratios) if group[-1] == rows[-1] else int(group[-1]) + 1,
+        )
+        for group in groups
+    ]
 
 
 def seen_by(
-    outer: Revolution, ends: Sequence[OpaquePart], pixels: Photographs
+    outer: Revolution, opaque: Sequence[OpaquePart], pixels: Photographs
 ) -> Bool[np.ndarray, " rays"]:
-    """Returns which pixels see an opaque end first, or miss the surface."""
+    """Returns which pixels miss the surface, or see an opaque part: first, or behind the glass.
+
+    Behind the glass is where a straight ray leaves the surface.
+    """
     heights, (low, high) = _first_points(outer, pixels.rays)[:, 2], _extent(outer)
+    behind = _first_points(outer, _reversed(outer, pixels.rays))[:, 2]
     margin = _MARGIN * (high - low) / _ROWS
     found = np.isnan(heights)
-    for end in ends:
-        found |= (heights > end.low - margin) & (heights < end.high + margin)
+    for part in opaque:
+        for each in (heights, behind):
+            found |= (each > part.low - margin) & (each < part.high + margin)
     return found
+
+
+def _reversed(outer: Revolution, rays: Rays) -> Rays:
+    """Returns rays from beyond a surface back to their origins."""
+    origins, directions = jnp.asarray(rays.origins), jnp.asarray(rays.directions)
+    middle = jnp.asarray(outer.axis.point, jnp.float32)[None]
+    away = jnp.linalg.norm(origins - middle, axis=-1, keepdims=True)
+    return rays._replace(origins=origins + 2.0 * away * directions, directions=-directions)
 
 
 def colours_seen(
-    outer: Revolution, ends: Sequence[OpaquePart], rays: Rays
+    outer: Revolution, opaque: Sequence[OpaquePart], rays: Rays
 ) -> Float[np.ndarray, "rays 3"]:
-    """Returns the linear RGB of the opaque end that each ray meets first, NaN without any."""
+    """Returns the linear RGB of the opaque part that each ray meets first, NaN without any."""
     heights = _first_points(outer, rays)[:, 2]
     found = np.full((len(heights), 3), np.nan)
-    for end in ends:
-        found[heights > end.low if end.is_cap(outer) else heights < end.high] = end.colour
+    for part in opaque:
+        kind = part.kind(outer)
+        above = (heights > part.low) | (kind == "foot")
+        below = (heights < part.high) | (kind == "cap")
+        found[above & below & ~np.isnan(heights)] = part.colour
     return found
 
 
-def clear_part(outer: Revolution, ends: Sequence[OpaquePart]) -> Revolution:
-    """Returns the body between its opaque ends, with flat ends where they were."""
-    points, (low, high) = outer.points, _limits(outer, ends)
+def clear_part(outer: Revolution, opaque: Sequence[OpaquePart]) -> Revolution:
+    """Returns the body between its opaque foot and cap, with flat ends where they were."""
+    points, (low, high) = outer.points, _limits(outer, opaque)
     kept, (bottom, top) = points, _extent(outer)
     if high < top:
         last = int(np.argmax(kept[:, 1] >= high))
@@ -212,15 +261,15 @@ def clear_part(outer: Revolution, ends: Sequence[OpaquePart]) -> Revolution:
     return Revolution(outer.axis, profile, size, outer.relief, knots=outer.knots)
 
 
-def _limits(outer: Revolution, ends: Sequence[OpaquePart]) -> tuple[float, float]:
+def _limits(outer: Revolution, opaque: Sequence[OpaquePart]) -> tuple[float, float]:
     """Returns the heights between which the body is clear."""
     low, high = _extent(outer)
     apart = _APART * (high - low)
-    for end in ends:
-        if end.is_cap(outer):
-            high = end.low - apart
-        else:
-            low = end.high + apart
+    for part in opaque:
+        if part.kind(outer) == "cap":
+            high = part.low - apart
+        elif part.kind(outer) == "foot":
+            low = part.high + apart
     return low, high
 
 
@@ -232,12 +281,12 @@ def _at_height(
     return (one + share * (other - one))[None]
 
 
-def mesh_of_part(outer: Revolution, end: OpaquePart) -> Mesh:
-    """Returns an opaque end as a closed mesh; hollows in the flat faces of the body are filled."""
+def mesh_of_part(outer: Revolution, part: OpaquePart) -> Mesh:
+    """Returns a cap or a foot as a closed mesh; hollows in flat faces of the body are filled."""
     lowest, highest = (find(outer.points[:, 1]) for find in (np.argmin, np.argmax))
     points = outer.points[lowest : highest + 1]
-    inside = points[(points[:, 1] > end.low) & (points[:, 1] < end.high)]
-    rims = np.stack([[inside[0, 0], end.low], [inside[-1, 0], end.high]])
+    inside = points[(points[:, 1] > part.low) & (points[:, 1] < part.high)]
+    rims = np.stack([[inside[0, 0], part.low], [inside[-1, 0], part.high]])
     side = even(np.concatenate([rims[:1], inside, rims[1:]]), _POINTS)
     normals = profile_normals(Profile(side, closed=False))
     still = np.zeros((len(side), 2, 0))
@@ -250,3 +299,43 @@ def mesh_of_part(outer: Revolution, end: OpaquePart) -> Mesh:
     return mesh_of(
         place(outline.turned, connected, _AZIMUTHS, outer.axis, np.zeros(5), relief=outer.relief)
     )
+
+
+def mesh_of_label(vessel: Vessel, x: Float[np.ndarray, " unknowns"], part: OpaquePart) -> Mesh:
+    """Returns a label as a closed mesh: a thin ring around the outer wall of a vessel.
+
+    Args:
+      vessel: model of the vessel.
+      x: its unknowns.
+      part: the label.
+    """
+    wall, count = vessel.outer_wall, vessel.layout.profile
+    moved = wall.curve(x[vessel.layout.outer], np.zeros((len(wall.knots), count)))
+    low, high = (wall.reach(moved, at, np.zeros(count))[0] for at in (part.low, part.high))
+    side = wall.piece(moved, np.linspace(low, high, _POINTS), np.zeros((_POINTS, count)))
+    height = np.ptp(vessel.outer.points[:, 1])
+    back, front = (
+        Stretch(side._replace(points=side.points + away * height * side.normals))
+        for away in (_APART, _APART + _THICKNESS)
+    )
+    back = back.reversed()
+    outline = _loop([front, _edge(front, back), back, _edge(back, front)])
+    return mesh_of(vessel.posed(outline, x))
+
+
+def _edge(before: Stretch, after: Stretch) -> Stretch:
+    """Returns the flat stretch between two others, with creases at both ends."""
+    (point, by_point), (there, by_there) = before.last(), after.first()
+    points, by_points = np.stack([point, there]), np.stack([by_point, by_there])
+    along = np.diff(points, axis=0)
+    normals = np.repeat(turn_right(along) / np.linalg.norm(along), 2, axis=0)
+    return Stretch(Turned(points, by_points, normals, np.zeros_like(by_points)))
+
+
+def _loop(stretches: Sequence[Stretch]) -> Outline:
+    """Joins stretches of which the last ends where the first begins, away from the axis."""
+    found = walls.joined(stretches)
+    count = len(found.poles) - 1
+    points, by_points, normals, by_normals = found.turned
+    turned = Turned(points[:count], by_points[:count], normals, by_normals)
+    return Outline(turned, np.zeros(count, bool), found.segments % count, found.ends)

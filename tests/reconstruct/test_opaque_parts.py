@@ -1,18 +1,25 @@
-"""Opaque caps and feet: where they are, what is left, and what is no such end."""
+"""Opaque caps, feet and labels: where they are, what is left, and what is no such end."""
 
 import numpy as np
 import pytest
 
-from refref_jax.geometry.triangle_meshes import face_vectors, is_watertight, volume
+from refref_jax.geometry.triangle_meshes import (
+    face_vectors,
+    is_watertight,
+    unit_vectors,
+    volume,
+)
 from refref_jax.reconstruct import opaque_parts, photometry, walls
+from refref_jax.reconstruct.contents import COARSE, Interior
 from refref_jax.reconstruct.families import Revolution
+from refref_jax.reconstruct.interiors import Vessel
 from refref_jax.reconstruct.mesh_distance import signed_distance
 from refref_jax.reconstruct.opaque_parts import OpaquePart, clear_part, find_opaque_parts
 from refref_jax.reconstruct.photometry import Backdrop
 from refref_jax.reconstruct.revolution import Profile
 from refref_jax.reconstruct.shape_from_refraction import SingleObject
 from refref_jax.reconstruct.shapes import FixedShape, mesh_of
-from tests.factories import revolved, vessels
+from tests.factories import revolved, scenes, vessels
 
 _BLUE, _ROW = (0.02, 0.05, 0.3), 2.6 / 128
 
@@ -73,6 +80,38 @@ def test_a_cap_and_a_foot_are_two_ends(body, surface, clear):
 
 
 @pytest.mark.slow
+def test_a_label_is_found_below_a_cap(body, surface, clear):
+    middle = float(body.points[:, 1].min()) + 0.9
+    label = OpaquePart(middle, middle + 0.5, (0.7, 0.7, 0.6))
+    found = find_opaque_parts(body, surface, _painted(body, clear, label, _cap(body, 0.4)))
+    assert [part.kind(body) for part in found] == ["label", "cap"]
+    assert (found[0].low, found[0].high) == pytest.approx((label.low, label.high), abs=2.0 * _ROW)
+    assert found[0].colour == pytest.approx(label.colour, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("rows", "runs"),
+    [
+        ("ooooo" + 95 * ".", [(0, 5)]),
+        ("??ooo" + 95 * ".", [(0, 5)]),
+        (40 * "." + 5 * "o" + 55 * ".", [(40, 45)]),
+        (40 * "." + "oo?oo" + 55 * ".", [(40, 45)]),
+        (40 * "." + "?oooo?" + 54 * ".", []),  # four known rows are too few for a label
+        (97 * "." + "oo?", [(97, 100)]),
+        (10 * "o" + 40 * "." + 10 * "o" + 30 * "." + 10 * "o", [(0, 10), (50, 60), (90, 100)]),
+        (98 * "o" + "..", []),
+        (40 * "." + 10 * "-" + 50 * ".", []),  # stained glass; as an end it would be dark enough
+        (90 * "." + 10 * "-", [(90, 100)]),
+        (85 * "." + 2 * "-" + 12 * "o" + "-", [(85, 100)]),  # one part, a cap
+        (100 * "?", []),
+    ],
+)
+def test_opaque_rows_are_a_foot_labels_or_a_cap(rows, runs):
+    shares = {"o": 0.1, "-": 0.3, ".": 0.5, "?": np.nan}
+    assert opaque_parts._opaque_rows(np.array([shares[letter] for letter in rows])) == runs
+
+
+@pytest.mark.slow
 def test_clear_glass_has_no_opaque_ends(body, surface, clear):
     assert find_opaque_parts(body, surface, _painted(body, clear)) == ()
 
@@ -102,7 +141,7 @@ def test_two_ends_that_leave_little_are_none(body, surface, clear):
 
 def test_a_high_cap_is_no_foot(body):
     cap, foot = _cap(body, 1.7), _foot(body, 0.3)
-    assert cap.is_cap(body) and not foot.is_cap(body)
+    assert (cap.kind(body), foot.kind(body)) == ("cap", "foot")
     assert clear_part(body, (foot, cap)).points[:, 1].max() == pytest.approx(cap.low, abs=0.02)
 
 
@@ -126,6 +165,21 @@ def test_glass_and_ends_are_apart_and_fill_the_body(body):
         assert inside(mesh.vertices).min() > 0.0
     total = sum(volume(mesh.vertices, mesh.faces) for mesh in (middle, *meshes))
     assert total == pytest.approx(volume(whole.vertices, whole.faces), rel=0.02)
+
+
+def test_pixels_that_see_the_back_of_a_label_are_left_out(body):
+    low, high = (float(each(body.points[:, 1])) for each in (np.min, np.max))
+    at = 0.7 * low + 0.3 * high
+    label = OpaquePart(at - 0.2, at + 0.2, _BLUE)
+    targets = np.array([[0.0, 0.0, at], [0.0, 0.0, at + 0.7], [9.0, 0.0, at]])
+    eyes = np.array([[4.0, 0.0, at], [4.0, 0.0, at + 0.7], [9.0, 9.0, at]])
+    down = (np.array([2.0, 0.0, at + 1.4]), np.array([-0.8, 0.0, at]))  # in above, out behind it
+    eyes, targets = np.vstack([eyes, down[0]]), np.vstack([targets, down[1]])
+    turned, point = body.axis.frame.T, body.axis.point
+    rays = scenes.rays(eyes @ turned + point, (targets - eyes) @ turned)
+    pixels = photometry.Photographs(rays, np.zeros((4, 3)), np.zeros(4, np.int32))
+    assert opaque_parts.seen_by(body, (label,), pixels).tolist() == [True, False, True, True]
+    assert opaque_parts.seen_by(body, (), pixels).tolist() == [False, False, True, False]
 
 
 @pytest.mark.slow
@@ -152,3 +206,20 @@ def test_a_foot_may_be_hollow(body):
     assert is_watertight(mesh.faces) and areas.min() > 0.0
     heights = (mesh.vertices - body.axis.point) @ body.axis.frame[:, 2]
     assert (heights.min(), heights.max()) == pytest.approx((foot.low, foot.high), abs=1e-6)
+
+
+def test_a_label_is_a_thin_ring_around_the_glass(body):
+    vessel = Vessel(body, Interior("none"), COARSE)
+    x = vessel.start()
+    x[:2], x[vessel.layout.outer] = (0.1, -0.05), 0.02
+    middle = float(body.points[:, 1].min()) + 0.9
+    mesh = opaque_parts.mesh_of_label(vessel, x, OpaquePart(middle, middle + 0.5, _BLUE))
+    (glass,) = (solid.mesh for solid in vessel.solids(x))
+    away = signed_distance(glass)(mesh.vertices)
+    height = np.ptp(body.points[:, 1])
+    assert is_watertight(mesh.faces)
+    assert away.min() == pytest.approx(0.002 * height, rel=0.1)
+    assert away.max() == pytest.approx(0.006 * height, rel=0.1)
+    facing = np.sum(unit_vectors(face_vectors(mesh.vertices, mesh.faces)) * mesh.normals[:, 0], -1)
+    assert facing.min() > 0.95
+    assert volume(mesh.vertices, mesh.faces) > 0.0

@@ -438,10 +438,11 @@ def test_bubbles_come_with_the_shape_that_is_chosen(scene, monkeypatch, tmp_path
 
 
 @pytest.mark.parametrize("is_vessel", [pytest.param(True, marks=pytest.mark.slow), False])
-def test_opaque_ends_are_parts_of_vessels_alone(scene, monkeypatch, tmp_path, is_vessel):
+def test_opaque_parts_are_those_of_vessels_alone(scene, monkeypatch, tmp_path, is_vessel):
     outer = vessels.bottle()
     top, colour = float(outer.points[:, 1].max()), (0.02, 0.05, 0.3)
     cap = OpaquePart(top - 0.5, top, colour)
+    labels = [OpaquePart(low, low + 0.2, (0.8, 0.8, 0.7)) for low in (top - 1.8, top - 1.4)]
     whole = mesh_of(outer.pose(outer.start()))
     masks = _trial("masks", whole, 1.35, 0.1 + _VIEWS)
     if is_vessel:
@@ -455,7 +456,7 @@ def test_opaque_ends_are_parts_of_vessels_alone(scene, monkeypatch, tmp_path, is
     monkeypatch.setattr(
         light_stage,
         "look_at_opaque_parts",
-        lambda *_, **options: light_stage.RevolvedObject(outer, (cap,)),
+        lambda *_, **options: light_stage.RevolvedObject(outer, (*labels, cap)),
     )
 
     def draw(path, *options):
@@ -469,7 +470,8 @@ def test_opaque_ends_are_parts_of_vessels_alone(scene, monkeypatch, tmp_path, is
     if not is_vessel:
         assert not facts.kept and facts.parts == () and "opaque" in facts.remark
         return
-    files = ["b_glass_glass.ply", "b_air_air.ply", "b_cap_opaque.ply"]
+    opaque = [f"b_{name}_opaque.ply" for name in ("label", "label1", "cap")]
+    files = ["b_glass_glass.ply", "b_air_air.ply", *opaque]
     assert [part.mesh for part in facts.parts] == files
     assert facts.parts[-1].radiance == colour
     part = object_source._read(target.parent, facts.parts[-1])
@@ -484,7 +486,7 @@ def test_a_ring_has_no_ends_and_holds_nothing(monkeypatch):
     mesh = make_mesh(ring.vertices, ring.faces)
     monkeypatch.setattr(light_stage, "fit_profile", None)  # would raise
     found = light_stage.look_at_opaque_parts(Path("nowhere"), mesh, None, None, seed=0)
-    assert found.outer is None and found.ends == ()
+    assert found.outer is None and found.opaque == ()
 
 
 @pytest.mark.parametrize(("after", "doubted"), [(0.03, False), (0.09, True)])
