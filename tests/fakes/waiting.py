@@ -6,7 +6,7 @@ python -m tests.fakes.waiting FOLDER
 import contextlib
 import signal
 import sys
-import threading
+from concurrent import futures
 from pathlib import Path
 
 from experiments.cli import app
@@ -28,11 +28,11 @@ if __name__ == "__main__":
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
     subprocesses.command_line = _command_line
     app.stop_at_kill()
-    worker = threading.Thread(target=_work, args=[Path(sys.argv[1])])
+    # Not `Thread.join`: interrupted once, it takes the thread for ended (CPython 3.11).
+    pool = futures.ThreadPoolExecutor(1)
     try:
-        worker.start()
-        worker.join()
+        futures.wait([pool.submit(_work, Path(sys.argv[1]))])
     except KeyboardInterrupt:
         with subprocesses.stopping():
-            worker.join()
+            pool.shutdown()
         sys.exit(app.INTERRUPTED)
