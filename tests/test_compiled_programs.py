@@ -57,6 +57,7 @@ def _dots(text):
     ]
 
 
+@pytest.mark.slow
 @_each_platform
 def test_tracing_has_no_product_that_a_device_would_round(training, platform):
     text = training[0](platform)

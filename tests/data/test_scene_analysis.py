@@ -324,6 +324,7 @@ def test_walls_of_one_colour_have_no_measurable_size():
     assert scene_analysis.fit_size_by_parallax(views, grey, around, "cube") is None
 
 
+@pytest.mark.slow
 def test_a_scene_that_states_no_size_gets_that_of_its_images(tmp_path):
     scene = shutil.copytree(BALL, tmp_path / "cube_smcvx_ball")
     properties = json.loads((scene / "scene.json").read_text())

@@ -281,6 +281,7 @@ def test_the_report_marks_the_front_and_sorts_by_time():
     assert "| `--free=1` | +1.00 | -10 % | free |" in text
 
 
+@pytest.mark.slow
 def test_a_sweep_writes_everything_and_outlives_a_point_that_fails(tmp_path):
     points = trade_points.sweep(preset="tiny", vary=["min_throughput", "paths"])
 

@@ -114,6 +114,7 @@ def test_gradients_of_the_blend_are_numerical():
     gradients.assert_numerical(colour, features, *leaves)
 
 
+@pytest.mark.slow
 def test_the_gate_begins_with_nearly_equal_shares():
     config = msnerf.KIND.sizes["tiny"].field
     params = jax.jit(lambda: msnerf.init_radiance(jax.random.key(0), config))()

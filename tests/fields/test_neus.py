@@ -313,6 +313,7 @@ def test_an_untrained_field_is_a_ball(config):
     assert not see(jnp.asarray(centre + np.array([0.0, 0.0, 0.26]))).within
 
 
+@pytest.mark.slow
 def test_only_the_field_of_a_place_learns_there():
     params = _trained(_NEUS)
 

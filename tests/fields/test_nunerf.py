@@ -164,6 +164,7 @@ class _Alone(nn.Module):
         return nunerf.split(point, self.config)
 
 
+@pytest.mark.slow
 def test_surface_opacity_and_losses_are_those_of_neus():
     ours, theirs = nunerf.KIND, neus.KIND
     assert ours.depth is theirs.depth

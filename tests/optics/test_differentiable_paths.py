@@ -105,6 +105,7 @@ def test_without_bends_nothing_is_traced():
     np.testing.assert_array_equal(path.throughput, 1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("truncated_paths", "weight"), [("background", 0.96), ("black", 0.0)])
 def test_a_path_that_runs_out_of_bends_is_as_bright_as_the_budget_says(truncated_paths, weight):
     slab = scenes.build(scenes.box((20.0, 20.0, 0.5)))

@@ -114,6 +114,7 @@ _trace_ends = jax.jit(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "rule",
     ["nested", *(pytest.param(rule, marks=pytest.mark.slow) for rule in ("facing", "priority"))],

@@ -65,6 +65,7 @@ def test_they_are_the_branches_of_the_tree_and_nearly_all_of_its_light():
         assert apart.min() < 1e-4
 
 
+@pytest.mark.slow
 def test_a_total_reflection_is_not_counted_twice():
     # Through a leg of the prism onto its hypotenuse, at 45 degrees: beyond the critical angle.
     scene = scenes.build(scenes.right_prism())

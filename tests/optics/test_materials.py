@@ -151,6 +151,7 @@ def test_a_conductor_reflects_by_its_index_relative_to_the_medium(around):
     np.testing.assert_allclose(path.directions[path.num_bends], [-1.0, 0.0, 0.0], atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_thin_sheet_reflects_twice_from_either_side_and_does_not_bend_light(sign):
     away = _moved(scenes.box((3.0, 3.0, 3.0)), 0.0, 20.0, 0.0)

@@ -234,6 +234,7 @@ def test_rays_that_miss_stay_straight():
     assert np.all(np.isinf(paths.tau[:3, 1:]))
 
 
+@pytest.mark.slow
 def test_the_paper_reflects_once_at_the_first_surface():
     scene = scenes.build(scenes.box((2.0, 2.0, 2.0), index=1.5))
     direction = np.array([0.6, 0.0, -0.8])

@@ -209,6 +209,7 @@ def test_untinted_light_is_conserved(settings):
     np.testing.assert_allclose(_sums(ends, traced), 1.0, atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "short_of",
     [

@@ -111,6 +111,7 @@ def test_overlap_of_corners_is_what_the_tracer_finds():
     )
 
 
+@pytest.mark.slow
 def test_a_box_gets_its_corners_and_overlaps_with_views_it_was_not_made_from():
     hull = _box_hull()
     stage = _refined(hull, _views(_turned_box))

@@ -190,6 +190,7 @@ def _photograph(vessel, surface, rays, views):
     return Photographs(jax.device_get(rays), rgb, views)
 
 
+@pytest.mark.slow
 def test_the_wall_of_a_liquid_is_seen_by_its_absorption_alone(mesh, inside):
     """Of the same index as the glass, so that light goes straight on from one into the other."""
     surface, (rays, views) = vessels.smooth_backdrop(), lit_scenes.pixels(400, reach=0.9)

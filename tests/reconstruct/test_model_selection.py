@@ -52,6 +52,7 @@ def _carved(views, *, resolution=48):
     return find_isosurface(carve(*views, resolution=resolution))
 
 
+@pytest.mark.slow
 def test_a_small_ball_on_a_table_is_a_sphere(monkeypatch):
     """With the families of fewest unknowns only, which take little time."""
     near = lambda mesh, *, furthest: [fit_sphere(mesh, furthest=furthest), FixedShape(mesh)]

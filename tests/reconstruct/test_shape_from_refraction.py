@@ -460,6 +460,7 @@ def test_a_fit_ends_after_two_steps_that_gain_little(world, glass, seen):
     assert len(gauss_newton.fit(glass, glass.start(), world, seen, settings=settings).steps) == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gain, fits", [(0.02, 2), (0.005, 1)])
 def test_a_free_surface_that_gains_nothing_on_a_family_ends(
     world, ball, seen, judges, monkeypatch, gain, fits

@@ -68,6 +68,7 @@ def test_straight_rays_and_none_are_rendered():
     assert render_image(model, nothing).rgb.shape == (0, 16, 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", [STRAIGHT, TREE])
 def test_scenes_without_objects_show_the_backdrop(settings):
     model = _model("radiance by direction, in an environment")

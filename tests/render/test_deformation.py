@@ -279,6 +279,7 @@ def _slopes_of_colours(params, config, path):
     return jnp.sum(_seen(config, params, path).composite.rgb)
 
 
+@pytest.mark.slow
 @_cases(_OFTEN[1:])
 def test_colours_train_the_deformation(kind, space):
     config = _config(kind, space)

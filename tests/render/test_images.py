@@ -31,6 +31,7 @@ def whole(model, rays):
     return render_image(model, rays)
 
 
+@pytest.mark.slow
 def test_an_image_has_the_shape_of_its_rays(whole):
     assert whole.rgb.shape == (16, 16, 3)
     assert whole.distance.shape == whole.mean_distance.shape == (16, 16)

@@ -107,6 +107,7 @@ def _painted(config, fog):
     return jax.jit(lambda *arguments: slopes(*arguments)[::-1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("multisamples", [pytest.param(1, marks=pytest.mark.slow), 6])
 @pytest.mark.parametrize("offset", [-0.4, 0.0, 0.3])
 @pytest.mark.parametrize(

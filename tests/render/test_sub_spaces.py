@@ -168,6 +168,7 @@ def as_sub_space(monkeypatch):
     return plant
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("last_sample", [pytest.param("middle", marks=pytest.mark.slow), "end"])
 def test_one_sub_space_equals_the_plain_field(as_sub_space, last_sample):
     config = dataclasses.replace(MODEL, last_sample=last_sample)
@@ -193,6 +194,7 @@ def _permuted(params, order, config):
     return jax.tree.map(jnp.asarray, tree)
 
 
+@pytest.mark.slow
 def test_the_order_of_sub_spaces_does_not_matter():
     params = _trained()
     one = _rendered(params, _CONFIG)
@@ -272,6 +274,7 @@ def test_light_of_a_backdrop_passes_through_each_sub_space_by_itself(planted):
 # --- the rest of the renderer ---
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "settings",
     [STRAIGHT, pytest.param(TREE, marks=pytest.mark.slow)],

@@ -86,6 +86,7 @@ def test_a_ray_beside_the_ball_ends_on_the_wall():
     assert found.surface.share < 1e-6 and found.composite.median > 10.0
 
 
+@pytest.mark.slow
 def test_weights_are_those_of_the_kinds_law():
     """The weights of NeuS from its own samples, in NumPy and float64."""
     params = _params(_CONFIG, 40.0)
@@ -132,6 +133,7 @@ def test_the_end_of_the_training_is_the_default_progress():
     assert not np.array_equal(first.histograms[-1].weights, last.histograms[-1].weights)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("config", "settings"),
     [

@@ -160,6 +160,7 @@ def test_a_path_of_an_unbounded_scene_ends_far_away():
     assert float(_warp(config, path).far) == 1000.0 + float(path.tau[2])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("origin", "direction", "far"),
     [

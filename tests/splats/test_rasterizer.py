@@ -315,6 +315,7 @@ def test_no_gaussians_and_empty_tiles(form):
     assert np.all(lonely.transmittance[8:, 8:] == 1.0) and lonely.transmittance.min() < 0.9
 
 
+@pytest.mark.slow
 @_often("chunks")
 def test_a_list_longer_than_a_chunk(form):
     """100 equal layers: the transmittance is a power, until it is below 1e-4."""

@@ -91,6 +91,7 @@ def test_images_without_a_pixel_of_background_are_refused(scene, tmp_path):
         fit(config, out=tmp_path / "run")
 
 
+@pytest.mark.slow
 def test_a_wrong_size_of_the_background_leads_to_a_field_or_is_told(scene):
     lines = []
     wrong = TrainConfig().override(scene=str(scene), radius=9.5)

@@ -98,6 +98,7 @@ def test_wrong_options_are_refused_before_anything_is_compiled(changes, message,
         fit.prepare(_config(**changes), report=str)
 
 
+@pytest.mark.slow
 def test_weights_of_the_losses_are_those_of_the_kind():
     resolved, _ = fit.prepare(_config(), report=lambda line: None)
     assert resolved.config.losses.deformation_weights == (3e-3, 1e-3, 1e-4)

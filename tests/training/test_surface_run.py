@@ -238,6 +238,7 @@ def test_wrong_options_are_refused_before_anything_is_compiled(changes, message,
         fit.prepare(config, report=lambda line: None)
 
 
+@pytest.mark.slow
 def test_weights_of_the_losses_are_those_of_the_kind():
     for field, eikonal in (("neus", 0.1), ("unisurf", 0.0), ("nunerf", 0.1)):
         resolved, _ = fit.prepare(_config(field=field), report=lambda line: None)

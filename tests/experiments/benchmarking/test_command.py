@@ -287,6 +287,7 @@ def test_the_next_command_has_all_that_was_asked_for_and_can_be_given(tmp_path, 
     assert "its test views cannot be read" in answer.stdout and "Next: open " in answer.stdout
 
 
+@pytest.mark.slow
 def test_what_is_trained_is_evaluated_again_in_a_copy_without_results(tmp_path, serve, scenes):
     """As docs/benchmark.md has it."""
     scenes = scenes.replace("*", "cube_smcvx_ball")

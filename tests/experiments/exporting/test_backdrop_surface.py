@@ -101,6 +101,7 @@ def test_rays_into_the_textured_mesh_see_the_backdrop(space, tmp_path):
     assert np.mean(np.abs(seen - expected)) < 0.006
 
 
+@pytest.mark.slow
 @_each_space
 def test_a_panorama_looks_along_x_with_y_to_the_left(space):
     model, domain = _model(space), Domain(2.0, space, (0.1, -0.2, 0.3))

@@ -179,6 +179,7 @@ def test_creases_of_an_open_mesh_are_refused():
         fit_placement(_placed(mesh), Outlines(views, creased=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "wrong", [{"shift": (30.0, 0.0, 0.0)}, pytest.param({"size": 0.02}, marks=pytest.mark.slow)]
 )

@@ -526,6 +526,7 @@ def test_a_field_inside_learns_what_a_shape_leaves_unexplained(
     assert any("error of 0.0700" in line for line in said) == (interior == "field")
 
 
+@pytest.mark.slow
 def test_before_a_field_there_is_no_refinement_by_light(scene, whole, tmp_path, monkeypatch):
     out = tmp_path / "out"
     shutil.copytree(whole, out)

@@ -155,6 +155,7 @@ def test_the_index_is_found_where_the_exposure_of_images_drifts(
     assert known.error < 0.9 * unknown.error
 
 
+@pytest.mark.slow
 def test_a_background_that_was_begun_as_a_field_stays_one(ball_scene, tmp_path, monkeypatch):
     monkeypatch.setattr(fit, "train", lambda run, **options: False)
     learn = functools.partial(index_stage.learn_background, ball_scene, tmp_path, seed=3)

@@ -45,6 +45,7 @@ class _Node:
         self.remove, self.visible = remove, False
 
 
+@pytest.mark.slow
 def test_the_scene_shows_each_piece_once_and_nothing_of_the_last_pixel(straight_down, slab):
     scene = _Scene()
     made = controls.Scenery(scene, slab.surfaces, None)

@@ -81,6 +81,7 @@ def test_another_index_is_another_picture_of_the_same_programs(model):
     assert thin < 0.5 * thick and np.any(image_files.to_bytes(after.rgb) != before)
 
 
+@pytest.mark.slow
 def test_the_mask_is_the_disc_of_the_ball_and_distances_have_one_scale(model):
     mask = layers.draw(model, layers.MASK, _RAYS, **_OPTIONS)
     assert mask.dtype == np.uint8 and set(np.unique(mask)) == {0, 255}
