@@ -41,7 +41,8 @@ from refref_jax.reconstruct.families import Revolution, place, place_raised
 from refref_jax.reconstruct.gauss_newton import Candidate
 from refref_jax.reconstruct.revolution import Curve, Profile, lathe
 from refref_jax.reconstruct.shapes import LARGEST_STEP, LARGEST_TURN, Matrix, Posed, mesh_of
-from refref_jax.reconstruct.walls import Limits, Moved, Outline, Stretch, Wall
+from refref_jax.reconstruct.turned import Outline, Stretch, joined
+from refref_jax.reconstruct.walls import Limits, Moved, Wall
 
 # Knots of the offsets of the outer and of the inner wall.
 _KNOTS, _INNER_KNOTS = 36, 28
@@ -329,7 +330,7 @@ class Vessel:
         still = np.zeros(layout.profile)
         whole = walls.between(self.outer_wall, outer, self._plan[0], (0.0, still), (None, still))
         if interior.contents == "none":
-            return [walls.joined([whole])]
+            return [joined([whole])]
         inner = self._inner_wall(x, by)
         if interior.level_unknown:
             levels = self._levels(x, by)
@@ -337,13 +338,13 @@ class Vessel:
             bottom = self._inner.reach(inner, *levels[1])
         else:
             full = walls.between(self._inner, inner, self._plan[1], (0.0, still), (None, still))
-            inside, bottom = [walls.joined([full])], (0.0, still)
+            inside, bottom = [joined([full])], (0.0, still)
         if not interior.mouth:
-            return [walls.joined([whole]), *inside]
+            return [joined([whole]), *inside]
         glass = self._open(outer, inner, bottom, still)
         if interior.level_unknown:
             glass.append(walls.disc(glass[-1].last(), *levels[1]))
-        return [walls.joined(glass), *inside[: interior.filled]]
+        return [joined(glass), *inside[: interior.filled]]
 
     def _inner_wall(
         self, x: Float[np.ndarray, " unknowns"], by: Float[np.ndarray, "unknowns m"]
@@ -376,8 +377,8 @@ class Vessel:
         above = walls.between(self._inner, inner, self._plan[2], high, (None, still))
         surface = walls.disc(below.last(), *levels[0])
         return [
-            walls.joined([below, surface]),
-            walls.joined([walls.disc(above.first(), *levels[1]).reversed(), above]),
+            joined([below, surface]),
+            joined([walls.disc(above.first(), *levels[1]).reversed(), above]),
         ]
 
     def _open(

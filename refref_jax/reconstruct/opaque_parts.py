@@ -32,8 +32,7 @@ from refref_jax.reconstruct.photometry import Backdrop, Photographs
 from refref_jax.reconstruct.revolution import Profile, even, lathe, profile_normals, turn_right
 from refref_jax.reconstruct.shape_from_refraction import SingleObject
 from refref_jax.reconstruct.shapes import FixedShape, mesh_of
-from refref_jax.reconstruct.turned import Turned
-from refref_jax.reconstruct.walls import Outline, Stretch
+from refref_jax.reconstruct.turned import Outline, Stretch, Turned, joined
 from refref_jax.render.images import find_first_surface
 
 # Rows of places along the axis and sectors around it, and number of pixels that are sorted.
@@ -294,7 +293,7 @@ def mesh_of_part(outer: Revolution, part: OpaquePart) -> Mesh:
     nothing = np.zeros(0)
     bottom = walls.disc(stretch.first(), float(side[0, 1]), nothing).reversed()
     top = walls.disc(stretch.last(), float(side[-1, 1]), nothing)
-    outline: Outline = walls.joined([bottom, stretch, top])
+    outline: Outline = joined([bottom, stretch, top])
     connected = lathe(outline.poles, outline.segments, outline.ends, _AZIMUTHS)
     return mesh_of(
         place(outline.turned, connected, _AZIMUTHS, outer.axis, np.zeros(5), relief=outer.relief)
@@ -334,7 +333,7 @@ def _edge(before: Stretch, after: Stretch) -> Stretch:
 
 def _loop(stretches: Sequence[Stretch]) -> Outline:
     """Joins stretches of which the last ends where the first begins, away from the axis."""
-    found = walls.joined(stretches)
+    found = joined(stretches)
     count = len(found.poles) - 1
     points, by_points, normals, by_normals = found.turned
     turned = Turned(points[:count], by_points[:count], normals, by_normals)

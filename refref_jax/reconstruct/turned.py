@@ -6,10 +6,11 @@ square section. A dozen numbers describe each exactly, where a spline of many kn
 Source: ours.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.sparse import bsr_array, csr_array, hstack, kron
 
 from refref_jax.reconstruct.relief import Offsets, Relief
@@ -59,6 +60,78 @@ class Turned(NamedTuple):
     by_points: Float[np.ndarray, "points 2 m"]
     normals: Float[np.ndarray, "points 2"]
     by_normals: Float[np.ndarray, "points 2 m"]
+
+
+Point = tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2 m"]]
+"""A point of the half-plane and its derivatives."""
+
+
+class Stretch(NamedTuple):
+    """Part of a profile without creases.
+
+    Attributes:
+      turned: its points and normals, at least two.
+    """
+
+    turned: Turned
+
+    def reversed(self) -> "Stretch":
+        """Returns the same from the end to the beginning, of a solid on the other side."""
+        points, by_points, normals, by_normals = (each[::-1] for each in self.turned)
+        return Stretch(Turned(points, by_points, -normals, -by_normals))
+
+    def first(self) -> Point:
+        """Returns the first point and its derivatives."""
+        return self.turned.points[0], self.turned.by_points[0]
+
+    def last(self) -> Point:
+        """Returns the last point and its derivatives."""
+        return self.turned.points[-1], self.turned.by_points[-1]
+
+
+class Outline(NamedTuple):
+    """A profile of several stretches, with creases between them.
+
+    Attributes:
+      turned: its points and normals; the stretches that meet at a point have two normals there.
+      poles: points on the axis.
+      segments: the two points of each segment.
+      ends: the two normals of each segment.
+    """
+
+    turned: Turned
+    poles: Bool[np.ndarray, " points"]
+    segments: Int[np.ndarray, "segments 2"]
+    ends: Int[np.ndarray, "segments 2"]
+
+
+def joined(stretches: Sequence[Stretch]) -> Outline:
+    """Joins stretches from a point of the axis to another, each from the end of the one before."""
+    counts = [len(each.turned.points) for each in stretches]
+    kept = [each.turned.points[number > 0 :] for number, each in enumerate(stretches)]
+    slopes = [each.turned.by_points[number > 0 :] for number, each in enumerate(stretches)]
+    points, by_points = np.concatenate(kept), np.concatenate(slopes)
+    poles = np.zeros(len(points), bool)
+    poles[[0, -1]] = True
+    steps = np.arange(len(points) - 1)
+    first = np.concatenate(
+        [np.arange(n - 1) + s for n, s in zip(counts, _starts(counts), strict=True)]
+    )
+    return Outline(
+        Turned(
+            points,
+            by_points,
+            np.concatenate([each.turned.normals for each in stretches]),
+            np.concatenate([each.turned.by_normals for each in stretches]),
+        ),
+        poles,
+        np.stack([steps, steps + 1], axis=-1),
+        np.stack([first, first + 1], axis=-1),
+    )
+
+
+def _starts(counts: Sequence[int]) -> Int[np.ndarray, " stretches"]:
+    return np.cumsum(counts) - counts
 
 
 def without_unknowns(turned: Turned) -> Turned:

@@ -9,17 +9,15 @@ Source: ours.
 """
 
 import functools
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import KDTree
 
 from refref_jax.reconstruct import ReconstructionError
-from refref_jax.reconstruct.families import Turned
 from refref_jax.reconstruct.revolution import (
     Curve,
     Profile,
@@ -30,6 +28,7 @@ from refref_jax.reconstruct.revolution import (
     profile_normals,
     turn_right,
 )
+from refref_jax.reconstruct.turned import Point, Stretch, Turned
 
 # Points of a profile while it is prepared, and cells along the diameter while it is inset.
 _STEPS, _CELLS = 600, 300
@@ -210,49 +209,6 @@ class Wall:
         return at, (by_height - by_value[0]) / max(slope, _FLAT)
 
 
-Point = tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2 m"]]
-"""A point of the half-plane and its derivatives."""
-
-
-class Stretch(NamedTuple):
-    """Part of a profile without creases.
-
-    Attributes:
-      turned: its points and normals, at least two.
-    """
-
-    turned: Turned
-
-    def reversed(self) -> "Stretch":
-        """Returns the same from the end to the beginning, of a solid on the other side."""
-        points, by_points, normals, by_normals = (each[::-1] for each in self.turned)
-        return Stretch(Turned(points, by_points, -normals, -by_normals))
-
-    def first(self) -> Point:
-        """Returns the first point and its derivatives."""
-        return self.turned.points[0], self.turned.by_points[0]
-
-    def last(self) -> Point:
-        """Returns the last point and its derivatives."""
-        return self.turned.points[-1], self.turned.by_points[-1]
-
-
-class Outline(NamedTuple):
-    """A profile of several stretches, with creases between them.
-
-    Attributes:
-      turned: its points and normals; the stretches that meet at a point have two normals there.
-      poles: points on the axis.
-      segments: the two points of each segment.
-      ends: the two normals of each segment.
-    """
-
-    turned: Turned
-    poles: Bool[np.ndarray, " points"]
-    segments: Int[np.ndarray, "segments 2"]
-    ends: Int[np.ndarray, "segments 2"]
-
-
 End = tuple[float | None, Float[np.ndarray, " m"]]
 """Length along a wall at rest and its derivatives; `None` is the whole length."""
 
@@ -314,35 +270,6 @@ def bridge(before: Stretch, after: Stretch) -> Stretch:
             np.stack([by_normal, by_normal]),
         )
     )
-
-
-def joined(stretches: Sequence[Stretch]) -> Outline:
-    """Joins stretches from a point of the axis to another, each from the end of the one before."""
-    counts = [len(each.turned.points) for each in stretches]
-    kept = [each.turned.points[number > 0 :] for number, each in enumerate(stretches)]
-    slopes = [each.turned.by_points[number > 0 :] for number, each in enumerate(stretches)]
-    points, by_points = np.concatenate(kept), np.concatenate(slopes)
-    poles = np.zeros(len(points), bool)
-    poles[[0, -1]] = True
-    steps = np.arange(len(points) - 1)
-    first = np.concatenate(
-        [np.arange(n - 1) + s for n, s in zip(counts, _starts(counts), strict=True)]
-    )
-    return Outline(
-        Turned(
-            points,
-            by_points,
-            np.concatenate([each.turned.normals for each in stretches]),
-            np.concatenate([each.turned.by_normals for each in stretches]),
-        ),
-        poles,
-        np.stack([steps, steps + 1], axis=-1),
-        np.stack([first, first + 1], axis=-1),
-    )
-
-
-def _starts(counts: Sequence[int]) -> Int[np.ndarray, " stretches"]:
-    return np.cumsum(counts) - counts
 
 
 def places(points: Curve, count: int) -> Float[np.ndarray, " count"]:
