@@ -401,11 +401,12 @@ class Vessel:
     def solids(self, x: Float[np.ndarray, " unknowns"]) -> list[Solid]:
         """Returns the parts of the vessel, as those of an ordinary scene.
 
-        The part `glass` contains the others.
+        The part `glass` contains the others. Folds of the walls are cut off.
         """
         found: list[Solid] = []
         media = media_of(self.interior(x), self.layout)
-        parts = zip(self.interior_at_start.materials, self.pose(x).parts, strict=True)
+        posed = [self.posed(walls.without_loops(each), x) for each in self._pieces(x)]
+        parts = zip(self.interior_at_start.materials, posed, strict=True)
         for medium, (name, part) in zip(media, parts, strict=False):
             parent = 0 if found else NO_PARENT
             found.append(

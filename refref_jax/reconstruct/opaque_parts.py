@@ -333,7 +333,7 @@ def _edge(before: Stretch, after: Stretch) -> Stretch:
 
 def _loop(stretches: Sequence[Stretch]) -> Outline:
     """Joins stretches of which the last ends where the first begins, away from the axis."""
-    found = joined(stretches)
+    found = walls.without_loops(joined(stretches))
     count = len(found.poles) - 1
     points, by_points, normals, by_normals = found.turned
     turned = Turned(points[:count], by_points[:count], normals, by_normals)

@@ -28,7 +28,7 @@ from refref_jax.reconstruct.revolution import (
     profile_normals,
     turn_right,
 )
-from refref_jax.reconstruct.turned import Point, Stretch, Turned
+from refref_jax.reconstruct.turned import Outline, Point, Stretch, Turned
 
 # Points of a profile while it is prepared, and cells along the diameter while it is inset.
 _STEPS, _CELLS = 600, 300
@@ -53,6 +53,9 @@ _FACING_UP = 0.6
 
 # Circles of a horizontal surface, with its rim and its middle.
 _RINGS = 4
+
+# Length of the longest loop that is cut off, as a share of that of the profile.
+_LONGEST_LOOP = 0.1
 
 # Smallest slope of the height along a wall that still moves the point at a given height.
 _FLAT = 0.1
@@ -239,6 +242,60 @@ def shares(
     first, last = (float(np.interp(each, at, steps)) for each in (begin, end))
     found: np.ndarray = np.interp(np.linspace(first, last, count), steps, at)
     return (found - begin) / max(end - begin, 1e-12)
+
+
+def without_loops(outline: Outline) -> Outline:
+    """Returns a profile without the short loops in which it crosses itself.
+
+    A wall folds into such loops where it moves along its normals by more than the radius of a bend.
+    Their surfaces are inside out, and what remains has a crease there.
+    """
+    points, at, ends, begin = outline.turned.points, list[float](), [], 0
+    loops = _find_loops(points)
+    if not loops:
+        return outline
+    for first, last, share in loops:
+        at += [*range(begin, first + 1), first + share]
+        before, after = outline.ends[first, 0], outline.ends[last, 1]
+        ends += [outline.ends[begin:first], np.array([[before, before], [after, after]])]
+        begin = last + 1
+    kept = np.array([*at, *range(begin, len(points))])
+    row = np.minimum(kept.astype(int), len(points) - 2)
+
+    def interpolated(values: np.ndarray) -> np.ndarray:
+        share = (kept - row).reshape(-1, *(1,) * (values.ndim - 1))
+        return values[row] + share * (values[row + 1] - values[row])
+
+    moved = outline.turned._replace(
+        points=interpolated(points), by_points=interpolated(outline.turned.by_points)
+    )
+    steps = np.arange(len(kept) - 1)
+    segments = np.stack([steps, steps + 1], axis=-1)
+    poles = interpolated(outline.poles.astype(float)) == 1.0
+    return Outline(moved, poles, segments, np.concatenate([*ends, outline.ends[begin:]]))
+
+
+def _find_loops(points: Curve) -> list[tuple[int, int, float]]:
+    """Returns the segments that cross at each loop, and where on the first; no loop has another."""
+    start, along = points[:-1], np.diff(points, axis=0)
+    length = lengths(points)
+
+    def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+    away = start[None] - start[:, None]
+    area = cross(along[:, None], along[None])
+    area = np.where(area == 0.0, np.nan, area)
+    shares = [cross(away, each) / area for each in (along[None], along[:, None])]
+    meets = np.logical_and.reduce([(share > 0.0) & (share < 1.0) for share in shares])
+    near = length[None, :-1] - length[1:, None] < _LONGEST_LOOP * length[-1]
+    first, last = np.nonzero(np.triu(meets & near, 2))
+    found: list[tuple[int, int, float]] = []
+    for i in np.unique(first):
+        if not found or i > found[-1][1]:
+            j = int(last[first == i].max())
+            found.append((int(i), j, float(shares[0][i, j])))
+    return found
 
 
 def disc(rim: Point, height: float, by_height: Float[np.ndarray, " m"]) -> Stretch:

@@ -6,7 +6,8 @@ import types
 import numpy as np
 import pytest
 
-from refref_jax.geometry.triangle_meshes import volume
+from refref_jax.data.mesh_queries import winding_number
+from refref_jax.geometry.triangle_meshes import is_watertight, volume
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.reconstruct import (
     ReconstructionError,
@@ -14,6 +15,7 @@ from refref_jax.reconstruct import (
     interior_looks,
     interior_search,
     photometry,
+    walls,
 )
 from refref_jax.reconstruct.contents import Detail, Interior
 from refref_jax.reconstruct.families import Revolution
@@ -32,7 +34,15 @@ from refref_jax.reconstruct.interior_search import (
 from refref_jax.reconstruct.interiors import Vessel
 from refref_jax.reconstruct.mesh_distance import signed_distance
 from refref_jax.reconstruct.revolution import Axis, Profile
-from refref_jax.reconstruct.walls import inset, with_open_top, with_punt, without_ridges
+from refref_jax.reconstruct.shapes import mesh_of
+from refref_jax.reconstruct.turned import Outline, Turned
+from refref_jax.reconstruct.walls import (
+    inset,
+    with_open_top,
+    with_punt,
+    without_loops,
+    without_ridges,
+)
 from tests.factories import revolved, vessels
 from tests.laws import posed_surfaces
 
@@ -93,6 +103,53 @@ def test_parts_are_closed_nested_and_apart(vessel, seed):
     if len(solids) == 3:
         liquid, air = (each.mesh.vertices @ vessel.outer.axis.frame[:, 2] for each in solids[1:])
         assert liquid.max() < air.min()
+
+
+def test_a_profile_loses_its_loops():
+    points = [[0, 0], [1, 0], [1, 1], [1.2, 1.2], [1.2, 0.8], [0.9, 1.0], [0.9, 6], [0, 6]]
+    points = np.array(points, float)
+    numbers = np.arange(len(points) - 1)
+    normals = np.array([[np.cos(a), np.sin(a)] for a in np.arange(2 * len(numbers))])
+    still = np.zeros((len(points), 2, 0))
+    outline = Outline(
+        Turned(points, still, normals, np.zeros((len(normals), 2, 0))),
+        np.isin(np.arange(len(points)), (0, len(points) - 1)),
+        np.stack([numbers, numbers + 1], axis=-1),
+        2 * numbers[:, None] + np.arange(2),
+    )
+    found = without_loops(outline)
+    crossing = [1.0, 0.8 + 0.2 * 2.0 / 3.0]
+    expected = [[0, 0], [1, 0], crossing, [0.9, 1.0], [0.9, 6], [0, 6]]
+    np.testing.assert_allclose(found.turned.points, expected, atol=1e-12)
+    assert found.segments.tolist() == [[0, 1], [1, 2], [2, 3], [3, 4], [4, 5]]
+    # The two segments that meet at the crossing keep the normals of their outer ends.
+    assert found.ends.tolist() == [[0, 1], [2, 2], [9, 9], [10, 11], [12, 13]]
+    assert found.poles.tolist() == [True, False, False, False, False, True]
+    assert without_loops(found) is found
+
+
+def test_a_large_loop_is_no_fold():
+    points = np.array([[0, 0], [1, 0], [1, 1], [4, 1], [4, 0.5], [0.5, 0.5], [0.5, 2], [0, 2]])
+    assert walls._find_loops(points) == []
+
+
+def test_solids_have_no_folds(body):
+    vessel = Vessel(body, Interior("none"), _SMALL)
+    x = vessel.start()
+    wall = vessel.outer_wall
+    at_knots = wall.points[np.argmax(wall.hats, axis=0)]
+    # The bottom edge has a radius of 0.15.
+    edge = np.linalg.norm(at_knots - [0.86, wall.points[:, 1].min() + 0.04], axis=-1) < 0.12
+    x[vessel.layout.outer] = np.where(edge, -0.35, 0.0)
+    folded, (solid,) = mesh_of(vessel.pose(x).parts[0]), vessel.solids(x)
+    random = np.random.default_rng(0)
+    low, high = folded.vertices.min(axis=0), folded.vertices.max(axis=0)
+    places = random.uniform(low, high, (4000, 3))
+    turns = [
+        {round(number) for number in winding_number(mesh, places)} for mesh in (folded, solid.mesh)
+    ]
+    assert turns[0] - {0, 1} and turns[1] == {0, 1}
+    assert is_watertight(solid.mesh.faces)
 
 
 def test_walls_never_cross_however_far_they_move(body):
