@@ -16,6 +16,7 @@ the surface stays as it is.
 """
 
 import functools
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -114,6 +115,12 @@ class RevolvedObject(NamedTuple):
     outer: Revolution | None
     opaque: tuple[OpaquePart, ...] = ()
 
+    @property
+    def has_opaque_end(self) -> bool:
+        """Whether an end is opaque, where the glass is cut off; a label leaves it as it is."""
+        outer = self.outer
+        return outer is not None and any(part.kind(outer) != "label" for part in self.opaque)
+
     def opaque_seen(self, rays: Rays) -> Float[np.ndarray, "rays 3"]:
         """Returns the linear RGB of the opaque part that each ray meets first, NaN without any."""
         if self.outer is None or not self.opaque:
@@ -149,16 +156,17 @@ def run(
     revolved = look_at_opaque_parts(scene, mesh, surface, seen, seed=seed)
     trials = fit(scene, mesh, known, surface, seen, revolved, seed=seed)
     masks, chosen, remark = choose(scene, mesh, trials)
-    if revolved.opaque and chosen is not masks and not isinstance(chosen.model, Vessel):
-        chosen, remark = masks, "a part is opaque, and what remains is no vessel"
+    if revolved.has_opaque_end and chosen is not masks and not isinstance(chosen.model, Vessel):
+        chosen, remark = masks, "an end is opaque, and what remains is no vessel"
     kept = chosen is not masks
     written = revolved if isinstance(chosen.model, Vessel) else RevolvedObject(None)
     deviations = model_selection.normal_deviations(chosen) if kept else None
     parts: tuple[PartFacts, ...] = ()
     with atomic_files.written_folder(target.parent) as folder:
         if kept and isinstance(chosen.model, Vessel | ObjectWithBubbles):
-            solids = [*chosen.model.solids(chosen.fit.x), *_opaque_solids(written, chosen)]
-            parts = _write_parts(folder, target.stem, solids, known)
+            model, x = chosen.model, chosen.fit.x
+            opaque = _opaque_solids(written, model, x) if isinstance(model, Vessel) else []
+            parts = _write_parts(folder, target.stem, [*model.solids(x), *opaque], known)
         elif kept:
             meshes.write_mesh(folder / target.name, *chosen.mesh)
         views = (scene, seen.split)
@@ -239,17 +247,18 @@ def _write_parts(
     return tuple(facts)
 
 
-def _opaque_solids(revolved: RevolvedObject, chosen: Trial) -> list[Solid]:
-    """Returns the opaque parts of a vessel that was chosen."""
-    found: list[Solid] = []
-    outer, vessel = revolved.outer, chosen.model
-    for part in revolved.opaque if outer is not None and isinstance(vessel, Vessel) else ():
+def _opaque_solids(
+    revolved: RevolvedObject, vessel: Vessel, x: Float[np.ndarray, " unknowns"]
+) -> list[Solid]:
+    """Returns the opaque parts of a vessel."""
+    outer, found, labels = revolved.outer, [], itertools.count(1)
+    for part in revolved.opaque if outer is not None else ():
         name: str = part.kind(outer)
         if name == "label":
-            mesh = opaque_parts.mesh_of_label(vessel, chosen.fit.x, part)
-            name += str(sum(each.name.startswith(name) for each in found) or "")
+            mesh = opaque_parts.mesh_of_label(vessel, x, part)
+            name = f"label{next(labels)}"
         else:
-            mesh = opaque_parts.mesh_of_part(outer, part)
+            mesh = opaque_parts.mesh_of_end(outer, part)
         found.append(Solid(name, mesh, INDEX_OF_AIR, NO_PARENT, CLEAR, radiance=part.colour))
     return found
 
@@ -341,7 +350,7 @@ def fit(
     outlines = Outlines(views, seed=seed)
     if _may_be_vessel(outer, trials):
         trials = (*trials, *_vessels(outer, known, surface, seen, outlines, seed=seed))
-    if _is_unexplained(trials) and not revolved.opaque:
+    if _is_unexplained(trials) and not revolved.has_opaque_end:
         rival = min(trial.error for trial in trials)
         trials = (*trials, *_free_vessels(mesh, known, surface, seen, outlines, rival, seed=seed))
     masks, chosen, _ = choose(scene, mesh, trials)

@@ -100,6 +100,7 @@ class Vessel:
       >>> vessel.interior(fit.x).level
 
     Attributes:
+      outer: outer surface at rest.
       interior_at_start: contents at the start.
       layout: places of the unknowns.
       outer_wall: outer wall, without offsets.

@@ -5,8 +5,8 @@ shows another part of the backdrop there. So pixels are sorted by the place wher
 the surface; where their colours vary far less than those of the backdrop behind them, the surface
 is opaque. `clear_part` returns the glass between a foot and a cap; a label is a ring around it.
 
-Labels that do not go all the way round are not found, and shiny plastic is not opaque. A very dark
-liquid may pass as opaque.
+Labels that do not go all the way round are not found, nor are those of many colours, and shiny
+plastic is not opaque. A very dark liquid may pass as opaque.
 
 Source: ours; photo-consistency is that of Seitz and Dyer: Photorealistic Scene Reconstruction by
 Voxel Coloring (1997).
@@ -29,7 +29,14 @@ from refref_jax.reconstruct import gauss_newton, photometry, walls
 from refref_jax.reconstruct.families import Revolution, place
 from refref_jax.reconstruct.interiors import Vessel
 from refref_jax.reconstruct.photometry import Backdrop, Photographs
-from refref_jax.reconstruct.revolution import Profile, even, lathe, profile_normals, turn_right
+from refref_jax.reconstruct.revolution import (
+    Curve,
+    Profile,
+    even,
+    lathe,
+    profile_normals,
+    turn_right,
+)
 from refref_jax.reconstruct.shape_from_refraction import SingleObject
 from refref_jax.reconstruct.shapes import FixedShape, mesh_of
 from refref_jax.reconstruct.turned import Outline, Stretch, Turned, joined
@@ -41,18 +48,22 @@ _ROWS, _SECTORS, _PIXELS = 128, 12, 32_768
 # Fewest pixels of a place, and fewest independent numbers of a row.
 _MIN_PIXELS, _MIN_FREEDOM = 4, 60
 
-# Variation of the colours of opaque ends and of labels, as a share of that of the backdrop behind
-# them, and the least variation of a backdrop that tells anything, sRGB. Stained glass has down to
-# 0.33 in places, a label 0.13.
-_MAX_VARIATION, _MAX_OF_LABEL, _MIN_BACKDROP_VARIATION = 0.35, 0.25, 0.04
+# Largest variation of the colours of opaque ends and of labels, as a share of that of the backdrop
+# behind them, and the least variation of a backdrop that tells anything, sRGB.
+_MAX_END_VARIATION, _MAX_LABEL_VARIATION, _MIN_BACKDROP_VARIATION = 0.35, 0.25, 0.04
 
 # Least share of the rows that an end and a label take, and largest share of all parts together.
-_MIN_SHARE, _MIN_LABEL, _MAX_SHARE = 0.03, 0.05, 0.7
+_MIN_END_SHARE, _MIN_LABEL_SHARE, _MAX_SHARE = 0.03, 0.05, 0.7
+
+# Most rows within or at the end of a part of which nothing is known, and most rows within a label
+# that vary too much, such as those of a line of print.
+_MOST_UNKNOWN, _MOST_PRINTED = 8, 2
 
 # Rows beside a part whose pixels count as its own.
 _MARGIN = 1.5
 
-# Distance between the glass and an opaque part, and thickness of a label, as shares of the height.
+# Distance between the glass and an opaque part, and thickness of a label, as shares of the height
+# for ends, and of the diameter for labels.
 _APART, _THICKNESS = 0.002, 0.004
 
 # Points of the profile of a part and half-planes of its mesh, and points of the glass's profile.
@@ -171,36 +182,50 @@ def _opaque_rows(ratios: Float[np.ndarray, " rows"]) -> list[tuple[int, int]]:
         NaN where it is not known.
     """
     count = len(ratios)
-    ends = [run for run in _runs(ratios, _MAX_VARIATION) if run[0] == 0 or run[1] == count]
-    ends = [(first, last) for first, last in ends if last - first >= _MIN_SHARE * count]
+    found = _runs(ratios, _MAX_END_VARIATION, _MIN_END_SHARE)
+    ends = [run for run in found if run[0] == 0 or run[1] == count]
     labels = [
         (first, last)
-        for first, last in _runs(ratios, _MAX_OF_LABEL)
-        if last - first >= _MIN_LABEL * count and first > 0 and last < count
+        for first, last in _runs(ratios, _MAX_LABEL_VARIATION, _MIN_LABEL_SHARE, _MOST_PRINTED)
+        if all(last <= begin or first >= end for begin, end in ends)
     ]
-    labels = [run for run in labels if all(run[1] <= a or run[0] >= b for a, b in ends)]
-    found = sorted(ends + labels)
-    return found if sum(last - first for first, last in found) <= _MAX_SHARE * count else []
+    for parts in (sorted(ends + labels), ends):
+        if sum(last - first for first, last in parts) <= _MAX_SHARE * count:
+            return parts
+    return []
 
 
-def _runs(ratios: Float[np.ndarray, " rows"], most: float) -> list[tuple[int, int]]:
+def _runs(
+    ratios: Float[np.ndarray, " rows"], most: float, share: float, bridged: int = 0
+) -> list[tuple[int, int]]:
     """Returns the first row and the one after the last of each run of rows that vary little.
 
-    Rows of which nothing is known do not end a run, but nor do they begin one.
+    Args:
+      ratios: variation of each row; NaN where it is not known.
+      most: largest variation.
+      share: least share of the rows that are known to vary little.
+      bridged: most rows of a gap in a run that vary more.
     """
-    rows = np.flatnonzero(~np.isnan(ratios))
-    if not len(rows):
-        return []
-    still = ratios[rows] < most
-    groups = np.split(rows, np.flatnonzero(np.diff(still.astype(int))) + 1)
-    groups = [group for group in groups if ratios[group[0]] < most]
-    return [
-        (
-            0 if group[0] == rows[0] else int(group[0]),
-            len(ratios) if group[-1] == rows[-1] else int(group[-1]) + 1,
-        )
-        for group in groups
-    ]
+    count, found = len(ratios), list[list[int]]()
+    known = np.flatnonzero(~np.isnan(ratios))
+    for row in np.flatnonzero(ratios < most):
+        between = ratios[found[-1][-1] + 1 : row] if found else np.zeros(0)
+        varied = int(np.sum(between >= most))
+        near = varied <= bridged and len(between) - varied <= _MOST_UNKNOWN
+        if found and near:
+            found[-1].append(int(row))
+        else:
+            found.append([int(row)])
+    runs = []
+    for rows in found:
+        first, last = rows[0], rows[-1] + 1
+        if first == known[0] and first <= _MOST_UNKNOWN:
+            first = 0
+        if last == known[-1] + 1 and count - last <= _MOST_UNKNOWN:
+            last = count
+        if len(rows) >= share * count:
+            runs.append((first, last))
+    return runs
 
 
 def seen_by(
@@ -224,8 +249,8 @@ def _reversed(outer: Revolution, rays: Rays) -> Rays:
     """Returns rays from beyond a surface back to their origins."""
     origins, directions = jnp.asarray(rays.origins), jnp.asarray(rays.directions)
     middle = jnp.asarray(outer.axis.point, jnp.float32)[None]
-    away = jnp.linalg.norm(origins - middle, axis=-1, keepdims=True)
-    return rays._replace(origins=origins + 2.0 * away * directions, directions=-directions)
+    reach = jnp.linalg.norm(origins - middle, axis=-1, keepdims=True) + 2.0 * outer.size
+    return rays._replace(origins=origins + reach * directions, directions=-directions)
 
 
 def colours_seen(
@@ -280,7 +305,7 @@ def _at_height(
     return (one + share * (other - one))[None]
 
 
-def mesh_of_part(outer: Revolution, part: OpaquePart) -> Mesh:
+def mesh_of_end(outer: Revolution, part: OpaquePart) -> Mesh:
     """Returns a cap or a foot as a closed mesh; hollows in flat faces of the body are filled."""
     lowest, highest = (find(outer.points[:, 1]) for find in (np.argmin, np.argmax))
     points = outer.points[lowest : highest + 1]
@@ -303,18 +328,25 @@ def mesh_of_part(outer: Revolution, part: OpaquePart) -> Mesh:
 def mesh_of_label(vessel: Vessel, x: Float[np.ndarray, " unknowns"], part: OpaquePart) -> Mesh:
     """Returns a label as a closed mesh: a thin ring around the outer wall of a vessel.
 
+    It is tight, so that it bridges grooves and does not fold.
+
     Args:
       vessel: model of the vessel.
       x: its unknowns.
       part: the label.
     """
-    wall, count = vessel.outer_wall, vessel.layout.profile
-    moved = wall.curve(x[vessel.layout.outer], np.zeros((len(wall.knots), count)))
-    low, high = (wall.reach(moved, at, np.zeros(count))[0] for at in (part.low, part.high))
-    side = wall.piece(moved, np.linspace(low, high, _POINTS), np.zeros((_POINTS, count)))
-    height = np.ptp(vessel.outer.points[:, 1])
+    wall, still = vessel.outer_wall, np.zeros((_POINTS, vessel.layout.profile))
+    by_knots = np.zeros((len(wall.knots), vessel.layout.profile))
+    # A place on the glass: the wall may have moved away from the height that it had at first.
+    rest = wall.curve(np.zeros(len(wall.knots)), by_knots)
+    low, high = (wall.reach(rest, at, still[0])[0] for at in (part.low, part.high))
+    moved = wall.curve(x[vessel.layout.outer], by_knots)
+    side = _tight(wall.piece(moved, np.linspace(low, high, _POINTS), still).points)
+    along = np.gradient(side, axis=0)
+    normals = turn_right(along) / np.linalg.norm(along, axis=-1, keepdims=True)
+    by_points = np.zeros((*side.shape, vessel.layout.profile))
     back, front = (
-        Stretch(side._replace(points=side.points + away * height * side.normals))
+        Stretch(Turned(side + away * vessel.size * normals, by_points, normals, by_points))
         for away in (_APART, _APART + _THICKNESS)
     )
     back = back.reversed()
@@ -322,8 +354,21 @@ def mesh_of_label(vessel: Vessel, x: Float[np.ndarray, " unknowns"], part: Opaqu
     return mesh_of(vessel.posed(outline, x))
 
 
+def _tight(points: Curve) -> Float[np.ndarray, "even 2"]:
+    """Returns the shortest curve around a piece of a profile, from its lower end to its upper."""
+    kept: list[np.ndarray] = []
+    for point in points[np.argsort(points[:, 1], kind="stable")]:
+        while len(kept) > 1:
+            last, whole = kept[-1] - kept[-2], point - kept[-2]
+            if last[0] * whole[1] > whole[0] * last[1]:
+                break
+            kept.pop()
+        kept.append(point)
+    return even(np.stack(kept), _POINTS)
+
+
 def _edge(before: Stretch, after: Stretch) -> Stretch:
-    """Returns the flat stretch between two others, with creases at both ends."""
+    """Returns the straight stretch between two others, with creases at both ends."""
     (point, by_point), (there, by_there) = before.last(), after.first()
     points, by_points = np.stack([point, there]), np.stack([by_point, by_there])
     along = np.diff(points, axis=0)
@@ -333,7 +378,7 @@ def _edge(before: Stretch, after: Stretch) -> Stretch:
 
 def _loop(stretches: Sequence[Stretch]) -> Outline:
     """Joins stretches of which the last ends where the first begins, away from the axis."""
-    found = walls.without_loops(joined(stretches))
+    found = joined(stretches)
     count = len(found.poles) - 1
     points, by_points, normals, by_normals = found.turned
     turned = Turned(points[:count], by_points[:count], normals, by_normals)

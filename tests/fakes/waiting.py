@@ -31,7 +31,7 @@ if __name__ == "__main__":
     # Not `Thread.join`: interrupted once, it takes the thread for ended (CPython 3.11).
     pool = futures.ThreadPoolExecutor(1)
     try:
-        futures.wait([pool.submit(_work, Path(sys.argv[1]))])
+        pool.submit(_work, Path(sys.argv[1])).result()
     except KeyboardInterrupt:
         with subprocesses.stopping():
             pool.shutdown()

@@ -470,7 +470,7 @@ def test_opaque_parts_are_those_of_vessels_alone(scene, monkeypatch, tmp_path, i
     if not is_vessel:
         assert not facts.kept and facts.parts == () and "opaque" in facts.remark
         return
-    opaque = [f"b_{name}_opaque.ply" for name in ("label", "label1", "cap")]
+    opaque = [f"b_{name}_opaque.ply" for name in ("label1", "label2", "cap")]
     files = ["b_glass_glass.ply", "b_air_air.ply", *opaque]
     assert [part.mesh for part in facts.parts] == files
     assert facts.parts[-1].radiance == colour
