@@ -48,6 +48,7 @@ from refref_jax.reconstruct import (
 from refref_jax.reconstruct.bubbles import ObjectWithBubbles
 from refref_jax.reconstruct.contents import Solid
 from refref_jax.reconstruct.families import Revolution
+from refref_jax.reconstruct.free_vessels import FreeVessel
 from refref_jax.reconstruct.interior_looks import SearchSettings
 from refref_jax.reconstruct.interior_search import Finding
 from refref_jax.reconstruct.interiors import Vessel
@@ -159,7 +160,8 @@ def run(
     if revolved.has_opaque_end and chosen is not masks and not isinstance(chosen.model, Vessel):
         chosen, remark = masks, "an end is opaque, and what remains is no vessel"
     kept = chosen is not masks
-    written = revolved if isinstance(chosen.model, Vessel) else RevolvedObject(None)
+    turned = isinstance(chosen.model, Vessel) and not isinstance(chosen.model, FreeVessel)
+    written = revolved if turned else RevolvedObject(None)
     deviations = model_selection.normal_deviations(chosen) if kept else None
     parts: tuple[PartFacts, ...] = ()
     with atomic_files.written_folder(target.parent) as folder:

@@ -171,6 +171,10 @@ class FreeVessel(Vessel):
         )
         return [outer, _kept_below(inner, outer, _THINNEST * self.size)]
 
+    def _unfolded(self, x: Float[np.ndarray, " unknowns"]) -> list[Posed]:
+        """Returns the surfaces of the parts, which are no profiles."""
+        return self._surfaces(x)
+
     def prior(
         self, x: Float[np.ndarray, " unknowns"]
     ) -> tuple[Float[np.ndarray, "unknowns unknowns"], Float[np.ndarray, " unknowns"]]:

@@ -292,6 +292,10 @@ class Vessel:
         """Returns the surfaces of the parts, with columns for all unknowns."""
         return [self.posed(outline, x) for outline in self._pieces(x)]
 
+    def _unfolded(self, x: Float[np.ndarray, " unknowns"]) -> list[Posed]:
+        """Returns the surfaces of the parts without the folds of profiles."""
+        return [self.posed(walls.without_loops(each), x) for each in self._pieces(x)]
+
     def posed(self, outline: Outline, x: Float[np.ndarray, " unknowns"]) -> Posed:
         """Returns a profile turned around the axis, with columns for all unknowns."""
         shift, azimuths, layout = np.append(x[:4], 0.0), self.detail.azimuths, self.layout
@@ -406,8 +410,7 @@ class Vessel:
         """
         found: list[Solid] = []
         media = media_of(self.interior(x), self.layout)
-        posed = [self.posed(walls.without_loops(each), x) for each in self._pieces(x)]
-        parts = zip(self.interior_at_start.materials, posed, strict=True)
+        parts = zip(self.interior_at_start.materials, self._unfolded(x), strict=True)
         for medium, (name, part) in zip(media, parts, strict=False):
             parent = 0 if found else NO_PARENT
             found.append(

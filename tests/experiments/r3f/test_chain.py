@@ -29,6 +29,7 @@ from refref_jax.geometry.triangle_meshes import corner_normals, make_mesh
 from refref_jax.reconstruct import opaque_parts, refinement
 from refref_jax.reconstruct.bubbles import Bubble, ObjectWithBubbles
 from refref_jax.reconstruct.contents import COARSE, Interior
+from refref_jax.reconstruct.free_vessels import FreeVessel
 from refref_jax.reconstruct.gauss_newton import Fit
 from refref_jax.reconstruct.interiors import Vessel
 from refref_jax.reconstruct.mesh_distance import compare_meshes
@@ -479,6 +480,27 @@ def test_opaque_parts_are_those_of_vessels_alone(scene, monkeypatch, tmp_path, i
     np.testing.assert_allclose(part.radiance, np.broadcast_to(colour, part.radiance.shape))
     glass = meshes.read_part(target.parent / files[0], index=1.5)
     assert glass.vertices[:, 2].max() < part.vertices[:, 2].min()
+
+
+def test_a_label_alone_leaves_solids_and_free_vessels_as_they_are(scene, monkeypatch, tmp_path):
+    outer = vessels.bottle()
+    low = float(outer.points[:, 1].min()) + 0.9
+    revolved = light_stage.RevolvedObject(outer, (OpaquePart(low, low + 0.5, (0.8, 0.8, 0.7)),))
+    whole = mesh_of(outer.pose(outer.start()))
+    inner = whole._replace(vertices=whole.vertices.mean(axis=0) + 0.5 * whole.vertices)
+    free = FreeVessel(whole, inner, Interior("air", wall=0.1), spacings=(0.15, 0.15))
+    monkeypatch.setattr(light_stage, "look_at_opaque_parts", lambda *_, **options: revolved)
+    monkeypatch.setattr(light_figures, "draw", lambda path, *options: path.write_bytes(b"figure"))
+    masks = _trial("masks", whole, 1.35, 0.1 + _VIEWS)
+    known = records.IndexFacts("given", 1.5, 0.0, 0.04)
+    for number, model in enumerate((SingleObject(FixedShape(whole), 1.5), free)):
+        x = model.start()
+        chosen = Trial("the other", model, Fit(x, 1e-6 * np.eye(len(x)), ()), 0.02 + _VIEWS)
+        monkeypatch.setattr(light_stage, "fit", lambda *_, found=chosen, **options: (masks, found))
+        target = tmp_path / str(number) / "b_glass.ply"
+        facts = light_stage.run(scene, whole, known, "surface", target, seed=0)
+        assert facts.kept and not [part for part in facts.parts if "label" in part.mesh]
+        assert len(facts.parts) == 2 * number
 
 
 def test_a_ring_has_no_ends_and_holds_nothing(monkeypatch):
