@@ -370,9 +370,8 @@ def _clear_part(revolved: RevolvedObject, seen: Seen) -> tuple[Revolution | None
         each.chosen(np.flatnonzero(~opaque_parts.seen_by(revolved.outer, revolved.opaque, each)))
         for each in (seen.fitted, seen.judges)
     )
-    return opaque_parts.clear_part(revolved.outer, revolved.opaque), Seen(
-        fitted, judges, seen.split
-    )
+    clear = opaque_parts.clear_part(revolved.outer, revolved.opaque)
+    return clear, Seen(fitted, judges, seen.split)
 
 
 def _with_bubbles(

@@ -328,7 +328,7 @@ def mesh_of_end(outer: Revolution, part: OpaquePart) -> Mesh:
 def mesh_of_label(vessel: Vessel, x: Float[np.ndarray, " unknowns"], part: OpaquePart) -> Mesh:
     """Returns a label as a closed mesh: a thin ring around the outer wall of a vessel.
 
-    It is tight, so that it bridges grooves and does not fold.
+    It bridges grooves, as paper does, so that it never folds.
 
     Args:
       vessel: model of the vessel.
@@ -355,7 +355,7 @@ def mesh_of_label(vessel: Vessel, x: Float[np.ndarray, " unknowns"], part: Opaqu
 
 
 def _tight(points: Curve) -> Float[np.ndarray, "even 2"]:
-    """Returns the shortest curve around a piece of a profile, from its lower end to its upper."""
+    """Returns the convex curve around a piece of a profile, from its lower end to its upper."""
     kept: list[np.ndarray] = []
     for point in points[np.argsort(points[:, 1], kind="stable")]:
         while len(kept) > 1:
