@@ -13,9 +13,9 @@ import pytest
 from benchmarks.ahead_of_time import compile as ahead_of_time
 from benchmarks.ahead_of_time import counters, hopper, programs
 
-_each_platform = pytest.mark.parametrize(
-    "platform", ["cuda", pytest.param("tpu", marks=pytest.mark.slow)]
-)
+pytestmark = pytest.mark.slow
+
+_each_platform = pytest.mark.parametrize("platform", ["cuda", "tpu"])
 
 
 def _lowered(program):

@@ -144,6 +144,7 @@ def _carried_lists(scene):
     return [(int(rays), int(columns)) for rays, columns in found]
 
 
+@pytest.mark.slow
 def test_only_overlapping_bodies_make_rays_carry_lists():
     parts = [_BALL, scenes.ball(0.5, subdivisions=1, name="inner_water")]
     lists = {
@@ -177,6 +178,7 @@ def _traced_operations(material):
     return scene, sum(_tracing(scene, TREE).values())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [pytest.param(name, marks=() if name == "opaque" else pytest.mark.slow) for name in _MATERIALS],

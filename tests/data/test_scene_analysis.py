@@ -316,6 +316,7 @@ def test_the_size_of_the_background_is_measured_by_its_parallax(kind, space):
     assert scene_analysis.fit_size_by_parallax(views, other, (), kind) is None
 
 
+@pytest.mark.slow
 def test_walls_of_one_colour_have_no_measurable_size():
     views = _room_views(size=48)
     grey = np.full((24, 48, 48, 3), 99, np.uint8)

@@ -259,6 +259,7 @@ def test_gradients_reach_every_layer_and_table(name):
     assert all(leaf.any() for leaf in jax.tree.leaves(reached))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("transformation", transformations.ALL)
 @_few("density", "radiance", "nerfacto radiance with a skip")
 def test_transformations_change_nothing(name, transformation):
@@ -291,6 +292,7 @@ def _taught(name, precision, params, gaussians):
     return jax.tree.leaves(seen), slopes
 
 
+@pytest.mark.slow
 @_few("density", "radiance")
 def test_half_precision_is_near_single_precision(name):
     single, single_slopes = _taught(name, "float32", _parameters(name), _gaussians())

@@ -186,6 +186,7 @@ def _multisamples(count, seed=0):
     )
 
 
+@pytest.mark.slow
 def test_multisamples_are_averaged():
     gaussians = _multisamples(6)
     nested = {"params": {"grid": _parameters()["params"]}}
@@ -226,6 +227,7 @@ def _gradients(params, position, scale):
     return jax.grad(total, argnums=(0, 1, 2))(params, position, scale)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("position", [_POSITIONS[0], _POSITIONS[7], _POSITIONS[9], _POSITIONS[-1]])
 def test_gradients_reach_the_touched_entries_only(position):
     by_params, _, _ = _gradients(_parameters(), jnp.asarray(position), jnp.float32(0.02))
@@ -260,6 +262,7 @@ def test_check_grads():
     gradients.assert_numerical(by_place, [0.31, 0.62, 0.13], 0.05, rtol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("transformation", transformations.ALL)
 def test_transformations_change_nothing(transformation):
     batches = jnp.asarray(_POSITIONS[-3:]), jnp.array([0.0, 0.01, 1.0])

@@ -83,6 +83,7 @@ def test_a_gradient_does_not_depend_on_the_table(level):
     np.testing.assert_array_equal(first, huge)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("level", "order"),
     [pytest.param("dense", 2, marks=pytest.mark.slow), ("dense", 1), ("hashed", 1)],
@@ -101,6 +102,7 @@ def test_derivatives_by_table_and_position(level, order):
 # --- transformations ---
 
 
+@pytest.mark.slow
 @_LEVEL
 def test_values_do_not_depend_on_batching(level):
     table, points = single(_table(level)), single(_points("anywhere"))
@@ -112,6 +114,7 @@ def test_values_do_not_depend_on_batching(level):
         np.testing.assert_allclose(together.reshape(12, _FEATURES), flat, atol=_BLENDING)
 
 
+@pytest.mark.slow
 @_LEVEL
 def test_gradients_do_not_depend_on_batching(level):
     table, points = single(_table(level)), single(_points("anywhere"))

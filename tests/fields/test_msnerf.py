@@ -101,6 +101,7 @@ def test_a_blend_is_finite_and_its_shares_add_up_to_1(scale):
         np.testing.assert_array_equal(np.sort(blend.shares), [0.0, 0.0, 1.0])
 
 
+@pytest.mark.slow
 def test_gradients_of_the_blend_are_numerical():
     params = jax.tree.map(lambda x: np.asarray(x, np.float64), _trained().decoder)
     leaves, tree = jax.tree.flatten(params)

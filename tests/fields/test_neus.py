@@ -198,6 +198,7 @@ def _depth(config, seen, direction, length, *, progress=1.0, params=None):
     )
 
 
+@pytest.mark.slow
 def test_depth_of_an_interval_of_neus_by_hand():
     """The ball's radius is a quarter of an edge, which is half of the scene's radius."""
     towards, length = [0.0, 0.0, -1.0], 0.1
@@ -214,6 +215,7 @@ def test_a_ray_that_leaves_is_not_stopped(length):
     assert found == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("config", [_NEUS, _UNISURF], ids=["neus", "unisurf"])
 def test_beyond_the_ball_there_is_a_density(config):
     seen = _seen(-0.2, [0.0, 0.0, 1.0], within=False)
@@ -254,6 +256,7 @@ def _slopes_of_intervals(config):
     return jax.jit(jax.grad(stopped, has_aux=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "config", [_NEUS, pytest.param(_UNISURF, marks=pytest.mark.slow)], ids=["neus", "unisurf"]
 )
@@ -295,6 +298,7 @@ def test_the_laplacian_of_a_ball_is_two_over_the_radius():
     np.testing.assert_allclose(found, 2.0 / np.linalg.norm(points, axis=-1), rtol=2e-2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("config", [_NEUS, _UNISURF], ids=["neus", "unisurf"])
 def test_an_untrained_field_is_a_ball(config):
     params, centre = _initial(config), np.asarray(config.ball_centre)

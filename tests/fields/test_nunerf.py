@@ -135,6 +135,7 @@ def _in_numpy(point, weights, octaves=3):
     return (1.0 - transmission) * opaque + transmission * through, next(layers, None)
 
 
+@pytest.mark.slow
 def test_colours_are_those_of_the_formulas_in_numpy():
     rng = np.random.default_rng(2)
     module, found = _Alone(_CONFIG), []

@@ -66,6 +66,7 @@ def test_octaves_open_one_after_the_other_in_the_first_fifth_of_the_training():
     np.testing.assert_allclose(whole[0, 1], np.sin(2.0 * np.pi * np.asarray(x)), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_point_begins_nearly_where_it_is():
     config = raydef.KIND.sizes["tiny"].field
     params = jax.jit(lambda: raydef.init_radiance(jax.random.key(0), config))()
@@ -77,6 +78,7 @@ def test_a_point_begins_nearly_where_it_is():
     assert 0.0 < np.max(np.abs(offsets.direction)) < 2e-3
 
 
+@pytest.mark.slow
 def test_density_and_colour_are_those_of_zipnerf():
     params = _trained()
     plain = zipnerf.RadianceFieldConfig(_GRID, **_SHAPE)
@@ -87,6 +89,7 @@ def test_density_and_colour_are_those_of_zipnerf():
     np.testing.assert_array_equal(seen.rgb, expected.rgb)
 
 
+@pytest.mark.slow
 def test_gradients_are_numerical():
     """At a place without kinks of the network's activation nearby."""
     leaves, tree = jax.tree.flatten(_trained().deformation)

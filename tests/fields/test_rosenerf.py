@@ -98,6 +98,7 @@ def _pair(*both):
     return Gaussians(*(jnp.concatenate(each) for each in zip(*both, strict=True)))
 
 
+@pytest.mark.slow
 def test_features_of_both_rays_are_added_by_plain_matrix_products():
     params = _trained()
     layers = jax.tree.map(lambda x: np.asarray(x, np.float64), params.field["params"])
@@ -147,6 +148,7 @@ def test_samples_are_those_of_both_rays_seen_from_the_first(space):
     np.testing.assert_allclose(bent.offsets, radii * offsets, atol=3e-6)
 
 
+@pytest.mark.slow
 def test_gradients_are_numerical():
     leaves, tree = jax.tree.flatten(_trained().rays)
 
@@ -157,6 +159,7 @@ def test_gradients_are_numerical():
     gradients.assert_numerical(offsets, jnp.array([0.3, 0.7, 0.55]), [0.36, 0.48, 0.8], *leaves)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [0.0, 1.0, 1e4])
 @pytest.mark.parametrize("place", [[0.5, 0.5, 0.5], [0.0, 1.0, 0.3]])
 def test_offsets_are_finite(scale, place):

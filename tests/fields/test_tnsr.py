@@ -54,6 +54,7 @@ def test_the_initial_surface_is_a_ball():
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_values_and_slopes_are_those_of_neus():
     """Slopes are differences, of values that `neus.radiance` returns for the same parameters."""
     config = _config()
@@ -75,6 +76,7 @@ def test_values_and_slopes_are_those_of_neus():
     np.testing.assert_allclose(jax.jit(slope)(surface, point), expected, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("place", "seen"),
     [((0.5, 0.5, 0.6), False), ((0.2, 0.1, 0.05), False), ((0.8, 0.9, 0.95), True)],
@@ -92,6 +94,7 @@ def test_light_comes_from_behind_the_ball_only(place, seen):
         np.testing.assert_allclose(found.rgb, around.rgb, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_an_index_is_learned_within_bounds():
     given, learned = _config(index=1.4), _config(index=1.4, index_from="learned")
     params = initial_field(given)

@@ -68,6 +68,7 @@ def _random_rays(count, seed=1, reach=3.0):
     return origins, arrays.unit(generator.uniform(-1, 1, (count, 3)) - origins)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moved", [0.01, 3.0])
 def test_a_tree_divided_like_that_of_other_places_has_the_same_hits(moved):
     triangles, (origins, directions) = _soup(400), _random_rays(200)
@@ -139,6 +140,7 @@ def test_no_ray_slips_through_a_closed_surface(target, subdivisions):
     np.testing.assert_allclose(distances, expected, atol=_DISTANCE_TOLERANCE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "count",
     [

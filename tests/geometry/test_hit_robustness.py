@@ -171,6 +171,7 @@ def test_a_ray_that_is_not_finite_hits_nothing_and_harms_no_other(broken):
     np.testing.assert_array_equal(np.isfinite(distances), whole)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("platform", ["cuda", pytest.param("tpu", marks=pytest.mark.slow)])
 def test_the_traversal_lowers_for_accelerators(platform):
     tree, _ = bvh_build.build(trimesh.creation.icosphere(subdivisions=1).triangles.astype("f4"))

@@ -96,6 +96,7 @@ def test_hits_of_a_torus_are_roots_of_its_quartic():
     np.testing.assert_allclose(distances[both], exact[both], atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [1.0, 3.0])
 def test_the_gradient_of_a_hit_is_the_closed_form(factor):
     origins, directions = _rays(40, seed=2)
@@ -123,6 +124,7 @@ def test_the_gradient_of_a_hit_is_the_closed_form(factor):
     assert gradients.all_finite(found)
 
 
+@pytest.mark.slow
 def test_normals_have_gradients_too():
     origin, direction = (x[0] for x in _rays(1, seed=6))
     towards = jnp.asarray(_CENTRE) - origin
@@ -146,6 +148,7 @@ def test_a_ray_from_the_surface_meets_its_other_side():
     assert limited == NO_PRIMITIVE
 
 
+@pytest.mark.slow
 def test_a_normal_that_faces_the_wrong_way_is_mirrored():
     """A slope by differences may be beyond grazing: the side is that of the values."""
 

@@ -62,6 +62,7 @@ def test_rays_outside_the_box_and_in_no_direction_have_a_place_too(tree):
     np.testing.assert_array_equal(np.sort(order), np.arange(6))
 
 
+@pytest.mark.slow
 def test_sorted_rays_find_the_same_hits(tree):
     rays, arguments = _rays(1001), _arguments(1001)
     arguments["limits"] = arguments["limits"].at[::3].set(0.7).at[1::5].set(-1.0)

@@ -104,6 +104,7 @@ def test_equal_images_are_at_no_distance_and_no_slope(params):
     np.testing.assert_allclose(slope, jnp.zeros_like(image), atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "level", [0.0, *(pytest.param(level, marks=pytest.mark.slow) for level in (0.5, 1.0))]
 )
@@ -121,6 +122,7 @@ def test_an_image_too_small_for_the_network_is_refused(params, shape):
         metrics.lpips(params, jnp.zeros(shape), jnp.zeros(shape))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "transformation",
     [pytest.param(transformations.jitted, marks=pytest.mark.slow), transformations.mapped],

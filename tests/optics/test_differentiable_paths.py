@@ -45,6 +45,7 @@ def _objects():
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "body", ["tinted box", *(pytest.param(b, marks=pytest.mark.slow) for b in ("ball", "box"))]
 )

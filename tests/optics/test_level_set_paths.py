@@ -57,6 +57,7 @@ def _sorted(ends):
     return np.asarray(ends.directions)[order], np.asarray(ends.throughput)[order]
 
 
+@pytest.mark.slow
 def test_a_ball_bends_light_as_the_analytic_ball_does():
     with jax.enable_x64(True):
         rays = jax.tree.map(lambda x: x.astype(jnp.float64), _rays(60))
@@ -229,6 +230,7 @@ def test_differentials_are_those_of_neighbouring_rays():
     assert np.linalg.norm(carried) > 1e-4
 
 
+@pytest.mark.slow
 def test_gradients_of_all_rays_are_finite():
     rays = _rays(100, seed=7, spread=1.6)
 

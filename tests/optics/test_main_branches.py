@@ -81,6 +81,7 @@ def test_a_ray_that_misses_has_one_path():
     assert list(found.statuses[0]) == [PathStatus.MISSED, *[PathStatus.EMPTY] * 3]
 
 
+@pytest.mark.slow
 def test_the_index_has_the_gradient_of_a_slab():
     """Shift across a slab of thickness 1: `sin a - cos a sin b / cos b`, Snell's law for `b`."""
     scene = scenes.build(scenes.box((40.0, 40.0, 1.0)))

@@ -116,6 +116,7 @@ def test_unknown_radiance_is_left_to_the_field_and_refused_elsewhere():
         shade(ends, lambda origin, direction: direction, rays=1)
 
 
+@pytest.mark.slow
 def test_the_colour_of_an_opaque_part_is_interpolated_between_corners():
     part = _sheet(material=Material("opaque", radiance="vertex_colours"))
     corners = np.repeat(part.vertices[part.faces][..., 1:2] * 0.5 + 0.5, 3, axis=2)
@@ -138,6 +139,7 @@ def _sheets(material, glass):
     return scenes.build(glass, _sheet(material=material), _moved(_sheet(material=other), 0, 40, 0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("around", [1.0, 1.5])
 def test_a_conductor_reflects_by_its_index_relative_to_the_medium(around):
     metal = Material("conductor", complex_index=_GOLD)
@@ -200,6 +202,7 @@ def test_dispersion_is_three_scenes_of_one_colour_each():
         np.testing.assert_allclose(found[:, channel], alone[:, channel], atol=2e-6)
 
 
+@pytest.mark.slow
 def test_dispersed_paths_belong_to_their_rays_and_share_their_light():
     glass = _BALL._replace(material=Material(dispersion=(1.4, 1.5, 1.6)))
     rays = _rays(0.1, 0.5, 2.0, *np.linspace(-0.9, 0.8, 6))
@@ -211,6 +214,7 @@ def test_dispersed_paths_belong_to_their_rays_and_share_their_light():
     assert np.all(np.sum(real > 0.0, axis=1) == 1)
 
 
+@pytest.mark.slow
 def test_one_colour_of_a_dispersive_scene_has_gradients_and_all_three_are_refused():
     scene = scenes.build(_BALL._replace(material=Material(dispersion=(1.4, 1.5, 1.6))))
     ray = jax.tree.map(lambda x: x[0], _rays(0.3))
@@ -223,6 +227,7 @@ def test_one_colour_of_a_dispersive_scene_has_gradients_and_all_three_are_refuse
     np.testing.assert_allclose(one.points, other.points, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_dispersion_reaches_the_medium_inside_another_one():
     water = scenes.ball(0.5, subdivisions=2, name="water")._replace(index=1.33)
     glass = _BALL._replace(material=Material(dispersion=(1.4, 1.5, 1.6)))
@@ -231,6 +236,7 @@ def test_dispersion_reaches_the_medium_inside_another_one():
     np.testing.assert_allclose(pairs[:, 1], [[1.0, 1.4], [1.0, 1.5], [1.0, 1.6]], rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("roughness", [0.1, 0.5, 1.0])
 def test_a_rough_surface_adds_no_light_and_scatters_around_the_mirror(roughness):
     scene = scenes.build(

@@ -280,6 +280,7 @@ def test_the_light_of_a_ray_is_shared_among_its_paths(priorities):
 # A camera inside.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rule", [pytest.param("nested", marks=pytest.mark.slow), "priority"])
 @pytest.mark.parametrize(
     ("start", "slots"),

@@ -41,6 +41,7 @@ def _visible(cosine, alpha):
     return 2.0 / (1.0 + np.sqrt(1.0 + alpha**2 * (1.0 / cosine**2 - 1.0)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degrees", [0.0, 40.0, 85.0])
 @pytest.mark.parametrize("alpha", [0.01, 0.09, 0.5, 1.0])
 def test_facets_have_the_distribution_of_visible_normals(degrees, alpha):
@@ -76,6 +77,7 @@ def test_masking_equals_the_formula_of_two_lambdas(alpha):
     np.testing.assert_allclose(found, (1.0 + one) / (1.0 + one + other), rtol=2e-5)
 
 
+@pytest.mark.slow
 def test_masking_at_the_extremes_is_finite_with_finite_gradients():
     for towards in (0.0, 1e-20, 1e-6, 1.0):
         for leaving in (-1.0, -1e-9, 0.0, 1e-20, 1e-6, 1.0):
@@ -91,6 +93,7 @@ def test_a_smooth_surface_has_its_own_normal():
     assert np.all(_facets(_incident(30.0), 0.0, count=10, normal=normal) == np.asarray(normal))
 
 
+@pytest.mark.slow
 def test_a_ray_always_meets_the_same_facet_and_neighbours_another():
     assert np.array_equal(_facets(_UP * -1.0, 0.3), _facets(_UP * -1.0, 0.3))
     near = jnp.array([[1.0, 2.0, 3.0], [1.0 + 2e-7, 2.0, 3.0]], jnp.float32)

@@ -137,6 +137,7 @@ def test_water_in_glass_bends_less_where_they_touch():
     _check_against_spheres(_ball_in_ball("facing"), facing, [0.1, 0.3, 0.5], 4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("height", "nested", "facing"),
     [(0.1, -2.23, -7.03), (0.5, -11.17, -39.29)],

@@ -95,6 +95,7 @@ def test_the_throughput_of_black_truncated_paths_is_dropped():
 _CUT = PathSettings(5, "all", min_throughput=0.039)
 
 
+@pytest.mark.slow
 def test_a_cut_branch_leaves_its_share_to_its_sibling():
     ends, traced = _ends(_slab(), _down(), settings=_CUT)
     # The inner reflection, 0.96 * 0.04, is below the cut: what enters leaves below, whole.
@@ -185,6 +186,7 @@ def test_the_papers_ablations_differ_from_its_budget_in_one_thing_each():
     np.testing.assert_allclose(followed["paper_no_reflection"].throughput, 1.0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_light_that_goes_round_inside_a_ball_ends_by_its_budget():
     # As many rays as others send into the ball: one program.
     inside = scenes.rays(np.tile([0.98, 0.0, 0.0], (64, 1)), [0.0, 1.0, 0.0])

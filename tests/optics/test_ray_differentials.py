@@ -116,6 +116,7 @@ def _legs(scene, rays):
     return path_tracing.trace(scene, rays, settings=TREE, capacity=1024, detail=detail).paths
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("index", [1.0, 1.0 + 1e-6, 1.5, 2.418])
 def test_spreads_are_finite_at_grazing_and_critical_angles(index):
     glass = scenes.build(scenes.ball(1.0, index=index, subdivisions=2), scenes.box((3, 3, 1e-3)))

@@ -150,6 +150,7 @@ def test_the_profile_of_revolution(fitted):
     posed_surfaces.assert_closed(posed)
 
 
+@pytest.mark.slow
 def test_flat_lids_stay_flat_and_rims_stay_narrow():
     mesh, _, _ = _body("cylinder")
     posed = fit_revolution(revolved.noisy(mesh, 0.005)).pose(np.zeros(40))
@@ -164,6 +165,7 @@ def test_flat_lids_stay_flat_and_rims_stay_narrow():
     assert np.degrees(np.arcsin(np.abs(normals[side, 2]))).mean() < 1.2
 
 
+@pytest.mark.slow
 def test_a_sharp_rim_becomes_as_round_as_the_smoothing():
     corners = np.array([[0.0, -1.0], [1.0, -1.0], [1.0, 1.0], [0.0, 1.0]])
     mesh = revolved.revolve(revolved.even(corners, 160), azimuths=96)
@@ -244,6 +246,7 @@ def _bottle(*, sides, ridges, lump=0.0):
     return revolved.noisy(make_mesh(vertices, round_one.faces), 0.005)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("sides", "ridges", "lump", "furthest"),
     [
@@ -350,6 +353,7 @@ def _prism(sides, *, warp=0.0):
 # A box has a turn and six distances. A prism with n sides has the direction of its axis, as many
 # azimuths as pairs of sides, and n + 2 distances; with five sides each has its azimuth, and the top
 # has its tilt.
+@pytest.mark.slow
 @pytest.mark.parametrize(("sides", "unknowns"), [(4, 9), (6, 13), (5, 16)])
 def test_nearly_right_angles_become_right(sides, unknowns):
     warped = fit_polyhedron(_prism(sides, warp=0.004))

@@ -72,6 +72,7 @@ def test_the_inner_wall_is_at_its_distance_and_above_its_base(mesh, vessel):
     assert volume(air.mesh.vertices, air.mesh.faces) > 0.0
 
 
+@pytest.mark.slow
 def test_a_rounded_edge_is_where_a_gaussian_puts_it():
     # With planes of the grid near those of the walls: between them, it cuts sharp edges.
     box = bodies.fine_box(1.0, spacing=0.25)
@@ -172,6 +173,7 @@ def test_specks_of_an_inside_are_left_out(mesh):
     assert not len(interior_looks._without_specks(specks[0], 0.1).faces)
 
 
+@pytest.mark.slow
 def test_a_look_traces_the_light_of_the_vessel(mesh, inside):
     surface, (rays, _) = vessels.smooth_backdrop(), lit_scenes.pixels(400, reach=0.9)
     kinds = [Interior(each, wall=0.12, glass=1.48) for each in ("air", "liquid")]
@@ -212,6 +214,7 @@ def test_the_wall_of_a_liquid_is_seen_by_its_absorption_alone(mesh, inside):
     assert errors[0] < 0.5 * errors[1] < 0.5 * errors[2] < 0.5 * clear
 
 
+@pytest.mark.slow
 def test_stained_glass_is_looked_at_with_its_tint(mesh, inside):
     surface, (rays, views) = vessels.smooth_backdrop(), lit_scenes.pixels(400, reach=0.9)
     clear = Interior("air", wall=0.12, stained=True)

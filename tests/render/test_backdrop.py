@@ -71,6 +71,7 @@ def test_faint_paths_have_one_tap():
     assert np.all(taps(ends, jnp.float32(0.0)) > 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [pytest.param(40, marks=pytest.mark.slow), 400])
 def test_the_radiance_may_be_linear_in_the_direction(count):
     domain, rays = _DOMAINS["spherical"], _rays(count)

@@ -200,6 +200,7 @@ def test_a_ray_beyond_a_wall_sees_it_where_it_stands():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", _ALL)
 def test_gradients_are_those_of_finite_differences(name):
     background = _ALL[name]
@@ -215,6 +216,7 @@ def test_gradients_are_those_of_finite_differences(name):
     gradients.assert_numerical(see, [0.3, -0.2, 0.1], [0.8, 0.31, 0.513], texels)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("transformation", transformations.ALL)
 @pytest.mark.parametrize("name", _ALL)
 def test_transformations_change_nothing(name, transformation):

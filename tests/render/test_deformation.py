@@ -120,6 +120,7 @@ def test_without_offsets_a_ray_is_straight(kind, space):
     np.testing.assert_allclose(found.bent.turned, found.bent.straight, atol=_ROUNDING)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind", ["raydef", pytest.param("raydef_polyline", marks=pytest.mark.slow)]
 )
@@ -158,6 +159,7 @@ def test_a_turned_sample_is_seen_from_elsewhere():
     np.testing.assert_allclose(found.bent.turned, turned, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("space", _SPACES)
 def test_moved_samples_stay_in_the_unit_cube(space):
     config = _config("raydef", space)

@@ -120,6 +120,7 @@ def test_only_the_field_in_front_of_the_backdrop_has_gradients():
     assert not any(np.any(leaf != 0.0) for leaf in jax.tree.leaves(slopes.field.backdrop))
 
 
+@pytest.mark.slow
 def test_only_given_parts_are_sampled(plant):
     first, second = (dataclasses.replace(_CLEAR, field_parts=parts) for parts in ((0,), (1,)))
     passed = np.exp(-0.8 * 1.5 / MODEL.radius)

@@ -95,6 +95,7 @@ def test_clear_glass_before_white_is_white(scene, rays, settings):
     np.testing.assert_allclose(seen.linear + seen.dropped, 1.0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_lost_light_is_told(scene, rays):
     tight = dataclasses.replace(TREE, min_throughput=0.0, max_bends=6, paths_per_ray=1.0)
     seen = render_known(scene, _WHITE, rays, settings=tight, tile=256)
@@ -231,6 +232,7 @@ def _image(scene, radiance, *, view=0, **options):
     return render_known_camera(scene, radiance, _CAMERA, view, settings=TREE, tile=_TILE, **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("view", [0, 1])
 def test_a_pixel_is_the_mean_of_its_rays(scene, view):
     seen = _image(scene, _environment(), view=view)
@@ -323,6 +325,7 @@ def test_refined_pixels_are_nearer_to_the_truth_than_more_rays_everywhere(scene)
     assert error < uniform
 
 
+@pytest.mark.slow
 def test_white_is_not_refined_and_zero_tolerance_refines_what_differs(scene):
     assert np.all(_image(scene, _WHITE, refined_rays_per_pixel=9).rays == 4)
     seen = _image(scene, _environment(), refined_rays_per_pixel=9, tolerance=0.0)
@@ -410,6 +413,7 @@ def _sun(edge):
     return jax.tree_util.Partial(_infinite_beyond, jnp.float32(edge))
 
 
+@pytest.mark.slow
 def test_infinite_light_is_infinite_in_refined_pixels(scene):
     seen = _image(scene, _sun(0.0), refined_rays_per_pixel=9)
     assert np.any(np.isinf(seen.linear)) and not np.any(np.isnan(seen.linear))
@@ -451,6 +455,7 @@ def test_impossible_numbers_of_rays_are_refused(scene, options, message):
         _image(scene, _WHITE, **options)
 
 
+@pytest.mark.slow
 def test_a_camera_inside_an_object_has_its_interior_list():
     scene = scenes.build(_BALL, rule="priority")
     here = _CAMERA._replace(poses=_CAMERA.poses * np.float32([1.0, 1.0, 1.0, 0.0]))

@@ -153,6 +153,7 @@ def test_a_wall_is_as_far_as_the_end_of_the_path(monkeypatch, space, order, samp
     assert np.all(_distances(monkeypatch, middle, _bent()) < arc - 0.1)
 
 
+@pytest.mark.slow
 def test_the_distance_of_what_is_in_front_of_the_wall_is_as_before(monkeypatch):
     seen = [_distances(monkeypatch, config, _bent(), fog=1e3) for config in (_MIDDLE, _END)]
     np.testing.assert_array_equal(*seen)
@@ -230,6 +231,7 @@ def _brightness(config):
     return jax.jit(jax.value_and_grad(brightness, argnums=(0, 1)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("multisamples", [pytest.param(1, marks=pytest.mark.slow), 6])
 @pytest.mark.parametrize("distance", [0.0, 7.5, 300.0])
 def test_values_and_gradients_are_finite_wherever_the_camera_is(distance, multisamples):

@@ -40,6 +40,7 @@ _SCENES = {
 _SLOW = ("glass ball, path tree", "water in glass, learned tints")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in _SLOW)) for name in _SCENES]
 )

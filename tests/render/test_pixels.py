@@ -190,6 +190,7 @@ def _hard_paths():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spread", [1e-4, 1.0, 100.0])
 def test_gradients_of_all_losses_are_finite_everywhere(spread):
     for paths in (_paths(), _hard_paths()):

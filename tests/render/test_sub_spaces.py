@@ -212,6 +212,7 @@ def _with_densities(params, raw):
     return jax.tree.map(jnp.asarray, tree)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [1e-4, 0.6, 100.0])
 @pytest.mark.parametrize(
     "raw", [(-1e10,) * 3, (1e10,) * 3, (-1e10, 1e10, 0.0), (0.0, 1e5, -1e5)], ids=str
@@ -259,6 +260,7 @@ def planted(monkeypatch):
     return render
 
 
+@pytest.mark.slow
 def test_light_of_a_backdrop_passes_through_each_sub_space_by_itself(planted):
     densities, shares = np.array([0.0, 2.0, 1e6]), np.array([0.5, 0.3, 0.2])
     colours = np.array([[0.9, 0.1, 0.2], [0.2, 0.7, 0.1], [0.3, 0.3, 0.6]])

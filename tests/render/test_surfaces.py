@@ -165,6 +165,7 @@ def _sum_of_a_path(params, config):
     return jnp.sum(seen.composite.rgb) + sums + moments
 
 
+@pytest.mark.slow
 @_KINDS
 @pytest.mark.parametrize("size", [0.0, 0.6, 30.0])
 def test_paths_are_finite_with_their_gradients(config, size):
@@ -197,6 +198,7 @@ def test_a_point_has_a_signed_distance_and_a_normal():
         assert np.all((seen.linear >= -0.0011) & (seen.linear <= 1.0011))
 
 
+@pytest.mark.slow
 def test_the_ball_of_a_scene_elsewhere():
     field = dataclasses.replace(_CONFIG.field, ball_centre=(0.6, 0.5, 0.4))
     config = dataclasses.replace(_CONFIG, field=field, centre=(1.0, 2.0, 3.0))

@@ -193,6 +193,7 @@ def test_histograms_are_sorted_and_hold_all_light(interior):
     assert np.isfinite(distances).all() and (distances >= config.near).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("some", [(1,), pytest.param((0, 2, 3), marks=pytest.mark.slow)])
 def test_rendering_many_paths_is_a_loop(some):
     paths = _some_paths()
@@ -328,6 +329,7 @@ def _arc_at_z(path, z):
 _WALL = 4.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("interior", _MODELS)
 def test_a_wall_behind_an_object_is_found_at_its_arc_length(plant, interior):
     path = _bent()
@@ -469,6 +471,7 @@ def test_a_model_that_is_moved_with_its_paths_gives_the_same(space):
     )
 
 
+@pytest.mark.slow
 @_each_space
 def test_samples_gradients_and_lookups_of_a_moved_model_are_the_same(space):
     centre = np.array([4.0, -2.0, 8.0], np.float32)

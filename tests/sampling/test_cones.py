@@ -268,6 +268,7 @@ _CASES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("transformation", transformations.ALL)
 @pytest.mark.parametrize("name", _CASES)
 def test_transformations_change_nothing(name, transformation):

@@ -146,6 +146,7 @@ def _many_outside_paths(paths):
     return lines, jax.vmap(near_knots)(lines)
 
 
+@pytest.mark.slow
 def test_no_sample_of_an_outside_path_lies_inside():
     paths = made_paths.stack(
         made_paths.random_path(seed, bends=6, segments=_SEGMENTS) for seed in range(_MANY)
@@ -225,6 +226,7 @@ _CASES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("transformation", transformations.ALL)
 @pytest.mark.parametrize("name", _CASES)
 def test_transformations_change_nothing(name, transformation):

@@ -349,6 +349,7 @@ def test_check_grads_of_warps():
     gradients.assert_numerical(functools.partial(scene_bounds.to_unit, warp), [0.1, 1.0, 10.0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("transformation", transformations.ALL)
 @pytest.mark.parametrize("function", [scene_bounds.to_distance, scene_bounds.to_unit])
 def test_transformations_change_nothing_of_warps(function, transformation):

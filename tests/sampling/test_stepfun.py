@@ -248,6 +248,7 @@ def test_count_below_is_a_right_sided_search():
     assert stepfun.count_below(values, queries).dtype == jnp.int32
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [0, 1, 2, 7, 8, 65])
 def test_accelerators_count_the_same_values_in_blocks(count):
     draw = np.random.default_rng(count)
@@ -315,6 +316,7 @@ _CASES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("transformation", [transformations.jitted, transformations.batched])
 @pytest.mark.parametrize("name", _CASES)
 def test_transformations_change_nothing(name, transformation):

@@ -70,6 +70,7 @@ def test_projection_is_that_of_gsplat(recorded):
     assert np.all((larger == 0) | (larger == 1)) and np.mean(larger) < 0.02
 
 
+@pytest.mark.slow
 def test_lists_are_those_of_gsplat(recorded):
     values, view = _as_recorded(recorded, np.float32)
     found = _projected(values, view)._replace(radii=jnp.float32(recorded["radii"]))
@@ -144,6 +145,7 @@ def test_projection_is_that_of_matrices():
         assert found.depths[i] == pytest.approx(depth, rel=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kernel", [pytest.param("classic", marks=pytest.mark.slow), "mip"])
 def test_derivatives_are_those_of_differences(kernel):
     def smooth(*leaves):
@@ -182,6 +184,7 @@ def _slopes_of_all(values, *, kernel):
     return sum(map(jnp.sum, found)), found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", _EXTREMES)
 @pytest.mark.parametrize("kernel", ["classic", "mip"])
 def test_projection_is_finite_and_so_are_its_derivatives(name, kernel):
@@ -191,6 +194,7 @@ def test_projection_is_finite_and_so_are_its_derivatives(name, kernel):
         assert not any(np.any(leaf) for leaf in jax.tree.leaves((found, slopes)))
 
 
+@pytest.mark.slow
 def test_views_look_as_the_cameras_do():
     seen = cameras.orbit(3, distance=4.0, elevation=0.3, size=16, angle_x=1.2)
     views, points = splats.views_of(seen), np.random.default_rng(0).normal(size=(20, 3))
@@ -205,6 +209,7 @@ def test_views_look_as_the_cameras_do():
         np.testing.assert_allclose(found.depths[visible], expected.depths[visible], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_harmonics_above_the_degree_are_left_out():
     value = jax.tree.map(lambda x: x[0], made_splats.gaussians(1))
     value = value._replace(harmonics=jnp.abs(value.harmonics) + 0.1, colours=jnp.full(3, 5.0))

@@ -122,6 +122,7 @@ def test_the_derivatives_are_those_of_a_plain_blend(form, scene):
     assert not np.any(slopes.depths) and not np.any(slopes.radii)
 
 
+@pytest.mark.slow
 @_often("native")
 def test_the_derivatives_of_gaussians_are_those_of_float64(form, scene):
     """From the reference's derivatives of the features, through the projection in float64."""
@@ -148,6 +149,7 @@ def test_the_derivatives_of_gaussians_are_those_of_float64(form, scene):
         np.testing.assert_allclose(mine, theirs, atol=1e-4 * np.abs(theirs).max())
 
 
+@pytest.mark.slow
 @_often("native")
 def test_one_gaussian_by_hand(form):
     scale, depth, focal = 0.1, 2.0, 20.0
@@ -164,6 +166,7 @@ def test_one_gaussian_by_hand(form):
     assert not np.any(seen.median_depths[~inside])
 
 
+@pytest.mark.slow
 @_often("native")
 def test_pixels_of_three_gaussians_by_hand(form):
     """Numbers of gsplat's projection and a plain blend, to six decimals."""
@@ -194,6 +197,7 @@ def test_pixels_of_three_gaussians_by_hand(form):
         assert float(seen.transmittance[y, x]) == pytest.approx(left, abs=2e-6)
 
 
+@pytest.mark.slow
 @_often("native")
 def test_the_nearer_of_two_planes_is_in_front(form):
     near = made_splats.one((0, 0, 2), scale=(5, 5, 0.01), opacity=0.75, colour=(1, 0, 0))
@@ -204,6 +208,7 @@ def test_the_nearer_of_two_planes_is_in_front(form):
         assert float(seen.median_depths[8, 8]) == 2.0
 
 
+@pytest.mark.slow
 @_often("native")
 def test_weights_and_transmittance_add_up_to_one(form, scene):
     values, view, *_ = scene
@@ -247,6 +252,7 @@ def test_moving_scene_and_camera_together_changes_nothing(form):
         assert np.mean(np.abs(np.asarray(first - second)) > 1e-4) < 1e-3
 
 
+@pytest.mark.slow
 @_often("native")
 def test_an_image_depends_on_neither_tiles_nor_capacity(form, scene):
     values, view, *_ = scene
@@ -305,6 +311,7 @@ def test_both_lists_are_equal():
     np.testing.assert_array_equal(both[0].entries[:total], both[1].entries[:total])
 
 
+@pytest.mark.slow
 @_often("native")
 def test_no_gaussians_and_empty_tiles(form):
     none = _image(splats.blank(0))
@@ -335,6 +342,7 @@ def test_a_list_longer_than_a_chunk(form):
     assert 1e-4 < float(left(thick)[1].transmittance[8, 8]) < 1e-2
 
 
+@pytest.mark.slow
 @_often("native")
 def test_opaque_gaussians_keep_a_thousandth_and_have_finite_derivatives(form):
     values = made_splats.joined(

@@ -80,6 +80,7 @@ def test_opacity_and_scale_of_a_shared_place_are_those_of_the_paper(count, opaci
         assert float(factor) == pytest.approx(1.0, rel=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("opacity", [0.4, 0.8])
 def test_a_relocation_preserves_the_image(opacity):
     """One opaque Gaussian and two transparent ones, which move to it."""
@@ -112,6 +113,7 @@ def test_sharing_preserves_the_opacity_along_a_line(count, opacity):
     assert many.sum() == pytest.approx(one.sum(), rel=1e-2)
 
 
+@pytest.mark.slow
 def test_draws_have_their_chances_and_none_is_impossible():
     count = 300_000
     chances = jnp.where(jnp.arange(count) % 3 == 0, 0.0, jnp.linspace(0.1, 1.0, count))
@@ -132,6 +134,7 @@ def test_relocations_hold_no_number_for_each_pair():
     assert compiled.memory_analysis().temp_size_in_bytes < 2**27
 
 
+@pytest.mark.slow
 def test_a_relocation_resets_the_moments_of_those_that_share_a_place():
     values = made_splats.gaussians(50)
     logits = values.logits.at[:10].set(-8.0).at[10:].set(jnp.linspace(-2.0, 3.0, 40))

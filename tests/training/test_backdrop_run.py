@@ -58,6 +58,7 @@ def test_a_backdrop_is_solved_and_rendered(scene, run):
     np.testing.assert_allclose(seen.accumulation, 1.0, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_scene_alone_chooses_the_backdrop(scene, tmp_path):
     asked = TrainConfig().override(scene=str(scene))
     lines = []

@@ -138,6 +138,7 @@ def test_paused_solving_is_the_same_as_solving_without_a_pause(ball):
         np.testing.assert_array_equal(ours, theirs)
 
 
+@pytest.mark.slow
 def test_the_number_of_rays_in_a_tile_does_not_matter(ball, monkeypatch):
     views = _views(2, 16)
     images = _photographs(ball, _environment(), views, STRAIGHT)
@@ -166,6 +167,7 @@ def _one_pixel(srgb, *, throughput=1.0, kept=1.0):
     return Block(lookups, nothing, linear, colour, jnp.full(1, kept), view)
 
 
+@pytest.mark.slow
 def test_one_vertex_seen_by_one_pixel_continues_everywhere():
     last = _solve([_one_pixel(0.5)])
     expected = float(pixels.srgb_to_linear(jnp.float32(0.5)))
@@ -226,6 +228,7 @@ def test_tints_are_found_with_the_radiance():
         np.testing.assert_array_equal(ours, theirs)
 
 
+@pytest.mark.slow
 def test_parts_that_no_pixel_sees_become_clear(ball):
     views = _views(2, 16)
     images = _photographs(ball, _environment(), views, STRAIGHT)
@@ -261,6 +264,7 @@ def test_gains_of_the_images_are_found_with_the_radiance(ball):
         np.testing.assert_array_equal(ours, theirs)
 
 
+@pytest.mark.slow
 def test_equal_images_have_equal_gains(ball):
     views = _views()
     blocks = _equations(ball, views, _photographs(ball, _environment(), views, STRAIGHT))

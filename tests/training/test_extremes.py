@@ -167,6 +167,7 @@ def test_a_perfect_batch_has_an_infinite_psnr_that_harms_nothing():
     assert gradients.all_finite((gradient, moved))
 
 
+@pytest.mark.slow
 @_each_precision
 def test_colours_below_black_are_drawn_back(precision):
     case = _case("field", precision)

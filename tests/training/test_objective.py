@@ -261,6 +261,7 @@ def _some_histograms(samples):
     return jax.tree.map(lambda *x: jnp.stack(x), *made)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("path_losses", "kept"), [("all", [0, 1, 2]), ("transmitted", [1, 2])])
 def test_losses_of_paths_are_those_of_the_included_paths(path_losses, kept):
     histograms = (_some_histograms(9), _some_histograms(12))
@@ -342,6 +343,7 @@ _CASES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("transformation", transformations.ALL)
 @pytest.mark.parametrize("name", _CASES)
 def test_transformations_change_nothing(name, transformation):
@@ -458,6 +460,7 @@ def test_gains_multiply_linear_light_and_their_geometric_mean_is_one():
     assert float(loss) == pytest.approx(np.mean((encoded - target) ** 2), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_a_gain_that_all_images_share_changes_nothing():
     gains, linear, target, views = _gained()
     with jax.enable_x64(True):

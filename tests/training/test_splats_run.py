@@ -24,7 +24,7 @@ from tests.factories.small_model import CAMERAS
 from tests.laws import expectations, runs
 from tests.processes.command import ROOT, run_command
 
-pytestmark = [pytest.mark.loose, pytest.mark.longest]
+pytestmark = [pytest.mark.loose, pytest.mark.longest, pytest.mark.slow]
 
 _SCENE = ROOT / "experiments" / "data" / "cube_smcvx_ball"
 _PERIODS = fit.Periods(log=5, checkpoint=10)

@@ -192,6 +192,7 @@ def test_photographs_of_which_little_is_left_are_refused():
         resampling.share([_frame(), narrow, _frame()])
 
 
+@pytest.mark.slow
 def test_every_pixel_is_inside_of_every_photograph():
     rng = np.random.default_rng(0)
     for _ in range(12):

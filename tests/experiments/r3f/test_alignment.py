@@ -33,6 +33,7 @@ def _errors(parts):
     return np.linalg.norm(parts[0].vertices.mean(axis=0)), radii.mean()
 
 
+@pytest.mark.slow
 def test_outlines_place_an_object_before_a_field(tmp_path, monkeypatch):
     scene = write_scene(tmp_path / "cube_smcvx_ball", size=64)
     monkeypatch.setattr(index_stage, "learn_backdrop", lambda *_, **options: None)
