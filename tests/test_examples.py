@@ -42,7 +42,13 @@ _TESTS = [test for name, value in (_MODULES | _NAMED).items() for test in _examp
 
 
 # Each compiles a tracer of its own, and its function is tested by every run of the suite.
-_SLOW = {"refref_jax.follow_main_branches", "refref_jax.render.shade", "refref_jax.trace"}
+_SLOW = {
+    "refref_jax.follow_branch",
+    "refref_jax.follow_main_branches",
+    "refref_jax.render.render_known_camera",
+    "refref_jax.render.shade",
+    "refref_jax.trace",
+}
 assert {test.name for test in _TESTS} >= _SLOW
 
 

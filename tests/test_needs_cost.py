@@ -195,6 +195,7 @@ def test_each_material_costs_operations_only_where_a_part_has_it(name):
     assert operations > fewest
 
 
+@pytest.mark.slow
 def test_a_clear_smooth_scene_of_one_index_compiles_to_as_much_as_before_the_materials():
     if jax.__version__ != "0.10.2":
         pytest.skip("operations were counted with jax 0.10.2")

@@ -9,9 +9,11 @@ from benchmarks.stability.measures import MEASURES
 pytestmark = pytest.mark.longest
 
 
-# In double precision, what `tests/geometry/test_hit_robustness.py` has of single hits, and scales
+# The lattice of `benchmarks.stability`, in double precision, what `tests/geometry/test_hit_robustness.py` has of single hits, and scales
 # beside those of powers of two.
 _SLOW = (
+    "ball",
+    "slabs of all ratios and angles",
     "ball, float64",
     "slabs of all ratios and angles, float64",
     "offsets 1 to 1e4",

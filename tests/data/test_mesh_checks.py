@@ -241,6 +241,7 @@ def test_a_part_that_would_vanish(priority):
     assert "Give it the higher number" in finding.message
 
 
+@pytest.mark.slow
 def test_a_part_may_vanish_in_one_that_is_not_its_parent():
     parts = [_ranked(p, f"{r}_glass", radius=r) for p, r in ((2, 3.0), (3, 2.0), (1, 1.0))]
     findings = _priorities(*parts)
@@ -374,6 +375,7 @@ def test_a_drink_that_is_shrunk_in_a_hollow_ball():
     assert _share(finding.message) == 1.0
 
 
+@pytest.mark.slow
 def test_a_drink_that_is_shrunk_in_the_air_of_a_cavity():
     """The cavity is a part of its own, so that the layer lies between a part and its parent."""
     parts = [

@@ -22,6 +22,7 @@ def _told(frames, angle=1.0):
     return {METADATA_KEY: parquet_scenes.encode(Contents(frames, angle))}
 
 
+@pytest.mark.slow
 def test_three_hundred_rows_are_three_splits(tmp_path):
     steps = []
     shards = write_copy(tmp_path, shards=2)

@@ -210,6 +210,7 @@ def test_the_rule_and_the_ambient_medium_are_those_of_the_scene(
     assert note in capsys.readouterr().out.splitlines()
 
 
+@pytest.mark.slow
 def test_dataset_check_uses_the_properties_of_the_scene(described):
     scene, _ = described
     made_of, _ = checks.check_meshes(scene)

@@ -70,6 +70,7 @@ def test_a_pixel_is_a_column_and_a_row():
     np.testing.assert_allclose(ray.directions, expected.directions)
 
 
+@pytest.mark.slow
 def test_a_column_is_drawn_for_each_run(tmp_path):
     edges = np.array([0.0, 2.0, 3.0, 4.0, 9.0])
     outside = np.array([True, False, False, True])

@@ -242,6 +242,7 @@ def test_gradients_reach_the_touched_entries_only(position):
         np.testing.assert_array_equal(np.asarray(gradient)[expected == 0.0], 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("position", [_POSITIONS[0], _POSITIONS[7], _POSITIONS[9]])
 @pytest.mark.parametrize("scale", [0.0, 1e-30, 0.1, 1e10, 1e30])
 def test_gradients_are_finite(position, scale):

@@ -49,6 +49,7 @@ def _direction():
     return jnp.array([0.36, 0.48, 0.8], jnp.float32)
 
 
+@pytest.mark.slow
 def test_outputs_by_plain_matrix_products():
     params = _trained()
     features = jax.jit(hash_grid.MultisampledGrid(_GRID, "float32").apply)

@@ -209,6 +209,7 @@ def test_depth_of_an_interval_of_neus_by_hand():
         np.testing.assert_allclose(found, log(signed + half) - log(signed - half), rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("length", [0.0, 0.1, 1e30])
 def test_a_ray_that_leaves_is_not_stopped(length):
     found = _depth(_NEUS, _seen(-0.2, [0.0, 0.0, 1.0]), [0.0, 0.0, 1.0], length)
@@ -222,6 +223,7 @@ def test_beyond_the_ball_there_is_a_density(config):
     np.testing.assert_allclose(_depth(config, seen, _TOWARDS, 2.0), 1.4, rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("config", [_NEUS, _UNISURF], ids=["neus", "unisurf"])
 def test_nothing_is_stopped_without_length(config):
     assert _depth(config, _seen(-0.2, [0.0, 0.0, 1.0]), [0.0, 0.0, -1.0], 0.0) == 0.0

@@ -162,6 +162,7 @@ def test_packets_and_lockstep_give_the_same_hits(count):
     np.testing.assert_allclose(packets[2], lockstep[2], atol=2e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "faces",
     [

@@ -143,6 +143,7 @@ def test_degenerate_triangles_are_never_hit():
     assert np.all(faces == -1)
 
 
+@pytest.mark.slow
 def test_duplicates_give_one_hit_whatever_their_order_and_the_company():
     soup = trimesh.creation.icosphere(subdivisions=1).triangles
     tree, _ = bvh_build.build(np.repeat(soup, 7, axis=0).astype(np.float32))

@@ -151,6 +151,7 @@ def test_nested_and_facing_differ_as_physics_says(height, nested, facing):
         assert np.degrees(np.arctan2(y, x)) == pytest.approx(expected, abs=0.3)
 
 
+@pytest.mark.slow
 def test_media_are_named_along_the_path():
     paths = _refracted(_ball_in_ball("nested"), scenes.rays([-4.0, 0.1, 0.0], [1.0, 0.0, 0.0]))
     # Parts are numbered in the order given: the outer ball is 1, the inner one 2.
@@ -356,6 +357,7 @@ def test_a_camera_inside_glass_starts_in_its_medium():
     np.testing.assert_allclose(paths.directions[0, 1, 0], sine, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_total_reflection_at_the_first_surface_needs_no_second_path():
     rays = scenes.rays([0.0, 0.0, 0.0], [0.5, 0.0, 0.45])
     paths = _trace(scenes.build(scenes.box((4.0, 4.0, 1.0))), rays).paths

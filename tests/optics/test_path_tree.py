@@ -106,6 +106,7 @@ def test_a_cut_branch_leaves_its_share_to_its_sibling():
     np.testing.assert_array_equal(ends.throughput, 1.0)
 
 
+@pytest.mark.slow
 def test_where_both_branches_are_below_the_cut_the_stronger_one_takes_all():
     ends, _ = _ends(_slab(tint=(0.04, 0.03, 0.02)), _down(), settings=_CUT)
     np.testing.assert_allclose(ends.throughput, [[0.0016, 0.0009, 0.0004]], rtol=1e-5)
@@ -199,7 +200,7 @@ def test_light_that_goes_round_inside_a_ball_ends_by_its_budget():
 @pytest.mark.parametrize(
     "settings",
     [
-        PAPER,
+        pytest.param(PAPER, marks=pytest.mark.slow),
         TREE,
         pytest.param(PathSettings(6, "all"), marks=pytest.mark.slow),
         pytest.param(PathSettings(6, "all", min_throughput=0.3), marks=pytest.mark.slow),

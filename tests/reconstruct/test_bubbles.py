@@ -288,6 +288,7 @@ def test_peaks_and_the_best_sphere_find_a_ball_from_chords():
     assert not peaks(trial, segments._replace(inside=np.zeros((6000, 1), bool)), errors)
 
 
+@pytest.mark.slow
 def test_inner_segments_of_a_ball_are_its_chords(world):
     del world
     rays, _ = _rays(7, 36)

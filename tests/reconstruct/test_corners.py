@@ -175,6 +175,7 @@ def test_masks_eroded_by_a_pixel_shrink_the_box_by_a_pixel():
     assert 0.8 - 1.5 * pixel < np.cbrt(volume_of(found)) / 2.0 < 0.8 - 0.5 * pixel
 
 
+@pytest.mark.slow
 def test_a_thin_wall_stays_one():
     carved = _carved(_views(_plate))
     body = fit_corners(convex.hull(carved), carved, _views(_plate))

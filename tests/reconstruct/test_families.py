@@ -190,6 +190,7 @@ def vase():
     return fit_revolution(_body("vase")[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["vase", pytest.param("ring", marks=pytest.mark.slow)])
 def test_revolution_as_a_shape(name, vase):
     shape = vase if name == "vase" else fit_revolution(_body(name)[0])

@@ -84,6 +84,7 @@ def test_a_rounded_edge_is_where_a_gaussian_puts_it():
         np.testing.assert_allclose(signed_distance(inner)(on), 0.0, atol=0.01)
 
 
+@pytest.mark.slow
 def test_a_rounding_thickens_a_curved_wall():
     ball = bodies.icosphere(4)
     rounding = interior_looks._ROUNDINGS[-1] * diameter(ball.vertices)
@@ -285,6 +286,7 @@ def test_the_inner_wall_follows_the_outer_one(vessel):
     np.testing.assert_allclose(np.linalg.norm(thinner, axis=-1), 0.03, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_finer_vessel_is_the_same_but_smoother_and_has_more_handles(vessel):
     x = vessel.start() + 0.001 * np.random.default_rng(0).normal(size=vessel.layout.count)
     finer = vessel.finer(x)
@@ -316,6 +318,7 @@ def test_a_finer_vessel_is_the_same_but_smoother_and_has_more_handles(vessel):
     assert abs(pulls[0]) > 1.0
 
 
+@pytest.mark.slow
 def test_a_finer_vessel_has_no_more_unknowns_than_memory_allows(vessel, monkeypatch):
     many = vessel.finer(vessel.start()).layout.count
     monkeypatch.setattr(free_vessels, "_MOST", 0.8 * many)

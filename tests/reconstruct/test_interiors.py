@@ -133,6 +133,7 @@ def test_a_large_loop_is_no_fold():
     assert walls._find_loops(points) == []
 
 
+@pytest.mark.slow
 def test_solids_have_no_folds(body):
     vessel = Vessel(body, Interior("none"), _SMALL)
     x = vessel.start()

@@ -155,6 +155,7 @@ def test_no_views_carve_nothing():
         carved_alone(Views(_views().masks[:0], cameras._replace(poses=cameras.poses[:0])))
 
 
+@pytest.mark.slow
 def test_the_view_that_overlaps_least_is_left_out():
     mesh = bodies.icosphere(3)
     kept = without_outliers(mesh, _halved(), 1)

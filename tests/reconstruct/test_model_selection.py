@@ -133,6 +133,7 @@ def test_one_view_cannot_judge():
     assert model_selection.shape_from_outlines(bodies.icosphere(), one) is None
 
 
+@pytest.mark.slow
 def test_a_sphere_far_from_the_outlines_comes_back_by_limited_steps():
     cameras = bodies.cameras_around(12, size=100, distance=3.2)
     views = Views(bodies.masks_of(_ball, cameras), cameras)

@@ -182,6 +182,7 @@ def test_glass_and_ends_are_apart_and_fill_the_body(body):
     assert total == pytest.approx(volume(whole.vertices, whole.faces), rel=0.02)
 
 
+@pytest.mark.slow
 def test_pixels_that_see_the_back_of_a_label_are_left_out(body):
     low, high = (float(each(body.points[:, 1])) for each in (np.min, np.max))
     at = 0.7 * low + 0.3 * high

@@ -192,6 +192,7 @@ def test_a_single_view_fits_a_profile(views):
     assert np.all(np.isfinite(found.points)) and found.points[:, 0].max() > 0.97
 
 
+@pytest.mark.slow
 def test_no_relief_is_tried_where_a_round_body_explains_the_masks(views, monkeypatch):
     tried = []
     monkeypatch.setattr(outlines_module, "_best_relief", lambda body, *_: tried.append(1) or body)

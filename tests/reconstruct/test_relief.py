@@ -144,6 +144,7 @@ def test_vertices_move_as_their_derivatives_say(outer):
     assert wrong < 0.1
 
 
+@pytest.mark.slow
 def test_parts_of_a_vessel_with_a_relief_are_closed_and_nested(relief):
     body = vessels.bottle()
     body = body.with_relief(Relief(-1.0, 2.0 / (len(relief.factors) - 1), relief.factors))

@@ -304,6 +304,7 @@ def test_a_sample_of_the_unknowns_tells_how_much_errors_of_a_view_are_alike(monk
     assert np.all(np.diag(some) > 2.0 * np.diag(np.linalg.inv(pixels + prior)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("absorption", [0.0, 0.5, 1e6])
 def test_lengths_of_main_paths_are_chords_and_finite_in_the_dark(world, ball, absorption):
     part = ball.pose(ball.start())
@@ -578,6 +579,7 @@ def test_creases_are_told_from_smooth_surfaces(mesh, creased):
     assert shape_from_refraction._has_creases(bodies.as_mesh(mesh)) == creased
 
 
+@pytest.mark.slow
 def test_no_pixels_are_refused_with_advice(world, glass, ball, seen):
     nothing = seen.chosen(np.zeros(0, np.int64))
     with pytest.raises(ReconstructionError, match=r"No pixel sees the object. Check the masks"):

@@ -54,6 +54,7 @@ def _random_pyramid(seed=1):
     )
 
 
+@pytest.mark.slow
 def test_faint_paths_have_one_tap():
     ends = _straight(_rays(200, radius=0.1))
     dimmed = ends._replace(throughput=jnp.full((200, 3), 0.05))

@@ -80,6 +80,7 @@ def test_scenes_without_objects_show_the_backdrop(settings):
     assert np.all(np.isfinite(bare.linear)) and np.abs(bare.linear - seen.linear)[met].max() > 0.01
 
 
+@pytest.mark.slow
 def test_every_ray_may_meet_an_object():
     model = _model("radiance by direction, in an environment")
     whole = image_rays(CAMERAS, 1)

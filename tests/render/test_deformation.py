@@ -132,6 +132,7 @@ def test_an_untrained_ray_is_nearly_straight(kind):
     assert not np.array_equal(found.rgb, expected.rgb)
 
 
+@pytest.mark.slow
 def test_moved_samples_are_those_of_a_moved_ray():
     """A ray at a right angle to its wall, moved along it; proposals see the moved one, too."""
     config = _config("raydef")

@@ -42,6 +42,7 @@ def test_a_ball_is_met_where_the_sphere_is_with_its_normal():
     assert np.min(np.sum(points * found.normals, axis=-1)) > np.cos(np.radians(0.2))
 
 
+@pytest.mark.slow
 def test_tiles_and_leading_axes_change_nothing():
     rng = np.random.default_rng(1)
     origins, directions = rng.normal(size=(2, 35, 3))

@@ -79,6 +79,7 @@ def test_an_image_of_several_tiles(model, rays, whole, monkeypatch):
         np.testing.assert_allclose(ours, expected, atol=2e-5)
 
 
+@pytest.mark.slow
 def test_nothing_is_compiled_twice(model):
     render_image(model, image_rays(CAMERAS, 0))
     before = images._trace_tile._cache_size(), images._render_chunk._cache_size()

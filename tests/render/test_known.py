@@ -243,6 +243,7 @@ def test_a_pixel_is_the_mean_of_its_rays(scene, view):
     assert seen.casts == casts and np.all(seen.rays == 4) and np.all(seen.dropped == 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side", [2, 4, 8])
 def test_an_edge_along_the_pixels_is_resolved_by_as_many_steps_as_there_are_rays(side):
     ahead = cameras.Cameras(np.eye(4, dtype=np.float32)[None, :3], 1, 1, 1.0)
@@ -334,6 +335,7 @@ def test_white_is_not_refined_and_zero_tolerance_refines_what_differs(scene):
     np.testing.assert_allclose(seen.linear, expected, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_pixels_beside_the_objects_have_four_first_rays_where_others_are_refined(scene):
     assert np.all(_image(scene, _WHITE, rays_per_pixel=1).rays == 1)
     seen = _image(scene, _environment(), rays_per_pixel=1, refined_rays_per_pixel=4, tolerance=9.0)
@@ -344,6 +346,7 @@ def test_pixels_beside_the_objects_have_four_first_rays_where_others_are_refined
     np.testing.assert_allclose(seen.linear, np.where(met[..., None], one, four), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_casts_of_a_refined_background_are_counted_once(scene):
     options = {"rays_per_pixel": 4, "refined_rays_per_pixel": 4, "tolerance": 0.0}
     seen = _image(scene, _environment(), **options)
@@ -362,6 +365,7 @@ def test_casts_of_a_refined_background_are_counted_once(scene):
     assert seen.casts == first + edges.sum() + again - bent.sum()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side", [1, 2, 3])
 def test_the_background_alone_is_measured_by_more_rays(scene, side):
     count, tolerance = side * side, 0.1
@@ -385,6 +389,7 @@ def test_the_background_alone_is_measured_by_more_rays(scene, side):
     assert np.all(seen.rays[inside] == count)
 
 
+@pytest.mark.slow
 def test_the_weight_of_first_rays_is_that_of_their_number():
     empty = refref_jax.assemble([])
     ahead = cameras.Cameras(np.eye(4, dtype=np.float32)[None, :3], 8, 8, 8.0)
@@ -478,11 +483,13 @@ def test_light_that_a_refined_pixel_loses_is_told(scene):
     np.testing.assert_allclose(seen.linear + seen.dropped, 1.0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_background_of_infinite_radiance_gives_no_nan(scene):
     seen = _image(scene, _sun(-1.1), refined_rays_per_pixel=9, tolerance=0.0)
     assert not np.any(np.isnan(seen.rgb))
 
 
+@pytest.mark.slow
 def test_few_rays_at_once_make_the_same_image(scene, monkeypatch):
     whole = _image(scene, _environment(), refined_rays_per_pixel=9)
     monkeypatch.setattr(images, "RAYS_OF_A_BAND", 500)

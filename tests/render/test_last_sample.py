@@ -159,6 +159,7 @@ def test_the_distance_of_what_is_in_front_of_the_wall_is_as_before(monkeypatch):
     np.testing.assert_array_equal(*seen)
 
 
+@pytest.mark.slow
 def test_what_is_in_front_of_the_wall_hides_it_as_before(monkeypatch):
     seen = [_render_painted(monkeypatch, config, _bent(), fog=1e3)[0] for config in (_MIDDLE, _END)]
     np.testing.assert_array_equal(*(each.rgb for each in seen))
@@ -184,6 +185,7 @@ def test_all_multisamples_of_the_end_lie_in_a_wall_that_is_met_head_on():
     np.testing.assert_allclose(radii, _RADIUS * arc / np.sqrt(2.0) * 0.5 / MODEL.radius, rtol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("multisamples", [1, 6])
 def test_only_the_last_interval_is_evaluated_elsewhere(multisamples):
     middle, end = (
@@ -208,6 +210,7 @@ def test_an_end_behind_a_bend_is_seen_along_the_last_direction():
     assert bool(found.points.outside[-1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("multisamples", [1, 6])
 def test_an_unbounded_scene_is_unchanged(multisamples):
     configs = (

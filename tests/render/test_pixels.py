@@ -199,6 +199,7 @@ def test_gradients_of_all_losses_are_finite_everywhere(spread):
         assert gradients.all_finite(got)
 
 
+@pytest.mark.slow
 def test_every_loss_teaches_what_it_is_meant_to():
     jitter = pixels.no_jitter(_CLEAR, 6)
     _, slopes = _loss_gradients(_params(_CLEAR), _paths(), jitter)

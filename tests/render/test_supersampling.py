@@ -71,6 +71,7 @@ def test_each_block_of_small_pixels_makes_its_own_pixel():
     np.testing.assert_allclose(seen.mean_distance, [[3.5, 5.5, 7.5], [15.5, 17.5, 19.5]])
 
 
+@pytest.mark.slow
 def test_one_ray_a_pixel_is_the_picture_itself(model):
     seen = render_camera(model, CAMERAS, 0, chunk=_CHUNK)
     for ours, expected in zip(

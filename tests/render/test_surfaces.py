@@ -178,6 +178,7 @@ def test_paths_are_finite_with_their_gradients(config, size):
 # --- points ---
 
 
+@pytest.mark.slow
 def test_a_point_has_a_signed_distance_and_a_normal():
     params = _params(_CONFIG)
     look = jax.jit(functools.partial(look_up_surface, params, _CONFIG))

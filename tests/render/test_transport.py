@@ -176,6 +176,7 @@ def test_a_path_always_has_room_for_samples(origin, direction, far):
         assert np.isfinite(leaf).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("interior", _MODELS)
 def test_histograms_are_sorted_and_hold_all_light(interior):
     config = _MODELS[interior]
@@ -342,6 +343,7 @@ def test_a_wall_behind_an_object_is_found_at_its_arc_length(plant, interior):
     np.testing.assert_allclose(seen.composite.mean[0], _arc_at_z(path, _WALL), atol=width)
 
 
+@pytest.mark.slow
 def test_what_hides_in_an_object_is_seen_by_the_field_interior_only(plant):
     # The object reaches from z = -1 to 0.92.
     path, scene = _bent(), Scene(wall=_WALL, hidden=(-0.05, 0.8))

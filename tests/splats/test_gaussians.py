@@ -50,6 +50,7 @@ def _projected(values, view, kernel="classic", **changes):
     return _project_all(values, view, kernel=kernel, **(_SIZE | changes))
 
 
+@pytest.mark.slow
 def test_projection_is_that_of_gsplat(recorded):
     with jax.enable_x64(True):
         values, view = _as_recorded(recorded)

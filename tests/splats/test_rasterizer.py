@@ -222,6 +222,7 @@ def test_weights_and_transmittance_add_up_to_one(form, scene):
     np.testing.assert_allclose(seen.colours[..., 1] + left, 1.0, atol=1e-5)
 
 
+@pytest.mark.slow
 @_often("native")
 def test_the_order_of_gaussians_does_not_matter(form, scene):
     values, view, *_ = scene
@@ -271,6 +272,7 @@ def _listed(projected, capacity):
     return images.make_lists(projected, _GRID, capacity=capacity)
 
 
+@pytest.mark.slow
 @_often("native")
 def test_lists_report_what_they_need(form):
     found = _PROJECT(made_splats.gaussians(300), made_splats.view())

@@ -73,6 +73,7 @@ def test_the_scene_alone_chooses_the_backdrop(scene, tmp_path):
         assert "preset=tiny" in other.describe()
 
 
+@pytest.mark.slow
 def test_a_field_inside_that_is_a_decision_keeps_the_backdrop(scene):
     asked = TrainConfig().override(scene=str(scene))
     decided, _ = prepare(asked.decided(interior="field"), report=lambda line: None)

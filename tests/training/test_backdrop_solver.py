@@ -72,6 +72,7 @@ def _equations(scene, views, images, *, settings=STRAIGHT, domain=_SKY, **option
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [1.0, 0.5])
 def test_only_pixels_among_a_mask_have_equations(share):
     views, empty = _views(), scenes.build()
@@ -183,6 +184,7 @@ def test_the_coverage_is_the_sum_of_the_weights_of_fitted_pixels():
     np.testing.assert_allclose(seen[0, _RESOLUTION // 2, _RESOLUTION // 2], 1.4, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_saturated_pixels_bound_the_radiance_from_below():
     # The same vertex is white in one pixel, and far brighter behind a dark filter.
     white, dimmed = _one_pixel(1.0), _one_pixel(0.5, throughput=0.05)
@@ -272,6 +274,7 @@ def test_equal_images_have_equal_gains(ball):
     np.testing.assert_allclose(last.gains, 0.0, atol=0.01)
 
 
+@pytest.mark.slow
 def test_a_black_image_leaves_all_gains_finite():
     last = _solve([_one_pixel(0.0), _one_pixel(0.5)], gains=jnp.zeros((2, 3)))
     assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(last[:4]))

@@ -177,6 +177,7 @@ def test_colours_below_black_are_drawn_back(precision):
     assert np.all(extremes.colour_bias(moved) > -8.0)
 
 
+@pytest.mark.slow
 @_each_precision
 @pytest.mark.parametrize(("target", "drawn_back"), [(255, False), (250, True)])
 def test_colours_above_white_are_drawn_back_unless_a_pixel_is_saturated(

@@ -157,6 +157,7 @@ def test_commands_evaluate_render_and_export_it(trained, tmp_path):
 # --- options ---
 
 
+@pytest.mark.slow
 def test_options_follow_from_the_scene_and_the_start():
     resolved, _ = _prepared()
     config = resolved.config
@@ -222,6 +223,7 @@ def test_a_learned_index_returns_from_its_bounds(index):
     assert found(jnp.float32(2.0))[1] > 0.0
 
 
+@pytest.mark.slow
 def test_a_surface_is_learned_where_described_meshes_are_gone(tmp_path):
     scene = tmp_path / "cube_smcvx_ball"
     shutil.copytree(_SCENE, scene, ignore=shutil.ignore_patterns("*.ply"))

@@ -73,6 +73,7 @@ def _assert_identical(a, b):
         np.testing.assert_array_equal(x, y)
 
 
+@pytest.mark.slow
 def test_checkpoints_are_written_while_the_clock_jumps(tmp_path, monkeypatch):
     state, jumps, now = _start(), np.random.default_rng(0), time.time
     monkeypatch.setattr(time, "time", lambda: now() + jumps.uniform(-1e6, 1e6))
@@ -105,6 +106,7 @@ class _ParamsOfBefore(NamedTuple):
     dyes: Any
 
 
+@pytest.mark.slow
 def test_a_checkpoint_of_an_earlier_version_is_read(tmp_path):
     config = dataclasses.replace(MODEL, interior="absorbing", learned_tints=2)
     state = init_state(CONFIG.seed, config, CONFIG.schedule)
@@ -150,6 +152,7 @@ def test_a_run_resumed_within_a_pool_may_take_other_strides(tmp_path):
     _assert_identical(last, whole)
 
 
+@pytest.mark.slow
 def test_one_pool_is_traced_ahead_and_no_more(monkeypatch):
     traced = []
     pretrace = loop.pretrace

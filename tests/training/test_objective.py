@@ -447,6 +447,7 @@ def _gained(seed=0):
     return rng.normal(0.0, 0.2, (4, 3)), linear, target, np.array([0, 1, 1, 2, 0, 2])
 
 
+@pytest.mark.slow
 def test_gains_multiply_linear_light_and_their_geometric_mean_is_one():
     gains, linear, target, views = _gained()
     with jax.enable_x64(True):
@@ -470,6 +471,7 @@ def test_a_gain_that_all_images_share_changes_nothing():
     np.testing.assert_allclose(np.asarray(slopes).sum(axis=0), 0.0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_slopes_of_gains():
     gains, linear, target, views = _gained(1)
     with jax.enable_x64(True):
@@ -481,6 +483,7 @@ def test_slopes_of_gains():
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("extreme", [0.0, 1e-30, 1e4])
 def test_gains_of_black_and_of_glaring_pixels_stay_finite(extreme):
     gains, _, target, views = _gained()

@@ -134,6 +134,7 @@ def test_objects_in_place_of_the_meshes_do_not_take_their_rule(scene):
     assert outside == [1.0]
 
 
+@pytest.mark.slow
 def test_a_run_continues_after_its_overlay_has_moved(scene, tmp_path):
     overlay = tmp_path / "mine.json"
     overlay.write_text('{"rule": "facing"}')

@@ -165,6 +165,7 @@ def test_tables_rank_it_with_ours_and_say_where_it_is_from():
     assert paper_tables.ablation_table(found).blocks == ()
 
 
+@pytest.mark.slow
 def test_the_report_shows_it_like_the_others(tmp_path):
     out = write_benchmark(tmp_path, ["cube_smcvx_ball"])
     ours, theirs = (out / plan.FOLDER / "cube_smcvx_ball" / name for name in ("tree", "mine"))

@@ -151,6 +151,7 @@ def test_a_tenth_of_wrong_sightings_does_not_matter():
     assert np.median(found.errors[~wrong]) < 0.1
 
 
+@pytest.mark.slow
 def test_deviations_are_those_of_repeated_noise():
     views = _views()
     seen, prior = _sightings(views, _POINTS), Prior(2e-4, 8e-4)

@@ -112,6 +112,7 @@ def test_cameras_in_a_painted_room_find_their_poses(room):
     )
 
 
+@pytest.mark.slow
 def test_a_view_of_nothing_keeps_its_pose_and_a_scene_of_nothing_is_refused(room):
     views, photos = room
     blank = [photo._replace(image=np.full_like(photo.image, 90)) for photo in photos]

@@ -56,6 +56,7 @@ def _expected(pinhole, **options):
     return _pattern((np.stack([columns, rows], axis=-1) - middle) / pinhole.focal, **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "distortion",
     [_BARREL, pytest.param(_CUSHION, marks=pytest.mark.slow), _FISHEYE],

@@ -78,6 +78,7 @@ def _bilinear(image, uv):
     return (1.0 - down) * above + down * below
 
 
+@pytest.mark.slow
 @_often_bounded
 def test_rays_into_the_textured_mesh_see_the_backdrop(space, tmp_path):
     model, domain = _model(space), Domain(2.0, space, (0.1, -0.2, 0.3))

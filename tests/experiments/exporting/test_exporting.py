@@ -117,6 +117,7 @@ def test_where_no_samples_are_taken_there_is_no_density(model):
     assert (everywhere.values > 0.0).all()
 
 
+@pytest.mark.slow
 def test_a_cavity_is_inside_and_what_is_between_bodies_is_not():
     scene = scenes.build(
         solids.ball("ball_glass", radius=1.0),

@@ -382,6 +382,7 @@ def test_light_is_kept_only_where_validation_views_say_so(
         assert _run(judged, out, _LIT, compare=False) == found
 
 
+@pytest.mark.slow
 def test_an_estimated_index_is_refined_with_the_surface(scene, whole, tmp_path, monkeypatch):
     out = tmp_path / "out"
     shutil.copytree(whole, out)
@@ -482,6 +483,7 @@ def test_opaque_parts_are_those_of_vessels_alone(scene, monkeypatch, tmp_path, i
     assert glass.vertices[:, 2].max() < part.vertices[:, 2].min()
 
 
+@pytest.mark.slow
 def test_a_label_alone_leaves_solids_and_free_vessels_as_they_are(scene, monkeypatch, tmp_path):
     outer = vessels.bottle()
     low = float(outer.points[:, 1].min()) + 0.9

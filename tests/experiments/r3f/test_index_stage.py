@@ -102,6 +102,7 @@ def _with_drifting_exposure(scene, folder):
     return copy, dict(zip(frames.names, gains.tolist(), strict=True))
 
 
+@pytest.mark.slow
 def test_photographs_are_divided_by_their_gains_but_where_they_are_saturated(ball_scene, tmp_path):
     scene, gains = _with_drifting_exposure(ball_scene, tmp_path)
     draw = functools.partial(index_stage.photographs, split="train", seed=0, rays=2000)
@@ -170,6 +171,7 @@ def test_a_background_that_was_begun_as_a_field_stays_one(ball_scene, tmp_path, 
     assert run_folder.read_config(tmp_path / "background") == begun
 
 
+@pytest.mark.slow
 def test_no_field_is_trained_where_only_a_backdrop_is_of_use(ball_scene, tmp_path, monkeypatch):
     monkeypatch.setattr(fit, "train", None)  # would raise
     scene = _unstated(ball_scene, tmp_path)
