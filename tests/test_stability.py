@@ -9,8 +9,8 @@ from benchmarks.stability.measures import MEASURES
 pytestmark = pytest.mark.longest
 
 
-# The lattice of `benchmarks.stability`, in double precision, what `tests/geometry/test_hit_robustness.py` has of single hits, and scales
-# beside those of powers of two.
+# What index-matched bodies and the white furnace trace as well, double precision, what
+# `tests/geometry/test_hit_robustness.py` has of single hits, and scales beside powers of two.
 _SLOW = (
     "ball",
     "slabs of all ratios and angles",
