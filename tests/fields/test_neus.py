@@ -259,9 +259,7 @@ def _slopes_of_intervals(config):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "config", [_NEUS, pytest.param(_UNISURF, marks=pytest.mark.slow)], ids=["neus", "unisurf"]
-)
+@pytest.mark.parametrize("config", [_NEUS, _UNISURF], ids=["neus", "unisurf"])
 @pytest.mark.parametrize("log_sharpness", [-20.0, 0.0, 20.0])
 @pytest.mark.parametrize("length", [0.0, 1e-20, 1.0, 1e30])
 def test_intervals_are_finite_with_their_gradients(config, log_sharpness, length):

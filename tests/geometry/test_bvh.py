@@ -144,11 +144,11 @@ def test_no_ray_slips_through_a_closed_surface(target, subdivisions):
 @pytest.mark.parametrize(
     "count",
     [
-        pytest.param(1, marks=pytest.mark.slow),
-        pytest.param(15, marks=pytest.mark.slow),
-        pytest.param(16, marks=pytest.mark.slow),
+        1,
+        15,
+        16,
         17,
-        pytest.param(100, marks=pytest.mark.slow),
+        100,
     ],
 )
 def test_packets_and_lockstep_give_the_same_hits(count):
@@ -166,14 +166,14 @@ def test_packets_and_lockstep_give_the_same_hits(count):
 @pytest.mark.parametrize(
     "faces",
     [
-        pytest.param(0, marks=pytest.mark.slow),
-        pytest.param(1, marks=pytest.mark.slow),
+        0,
+        1,
         12,
-        pytest.param(300, marks=pytest.mark.slow),
-        pytest.param(1500, marks=pytest.mark.slow),
+        300,
+        1500,
     ],
 )
-@pytest.mark.parametrize("lockstep", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("lockstep", [False, True])
 def test_spare_rows_change_no_hit(faces, lockstep):
     tree, slots = bvh_build.build(_soup(faces).astype(np.float32))
     filled = bvh_build.filled_up(tree)

@@ -105,9 +105,7 @@ def test_equal_images_are_at_no_distance_and_no_slope(params):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "level", [0.0, *(pytest.param(level, marks=pytest.mark.slow) for level in (0.5, 1.0))]
-)
+@pytest.mark.parametrize("level", [0.0, 0.5, 1.0])
 def test_flat_images_and_features_that_are_nothing_stay_finite(params, level):
     flat, (target, _) = jnp.full(_SHAPE, level), _images()
     assert gradients.all_finite(_slope(params, flat, target))
@@ -125,7 +123,7 @@ def test_an_image_too_small_for_the_network_is_refused(params, shape):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "transformation",
-    [pytest.param(transformations.jitted, marks=pytest.mark.slow), transformations.mapped],
+    [transformations.jitted, transformations.mapped],
 )
 def test_transformations_change_nothing(params, transformation):
     def distance(rendered, target):

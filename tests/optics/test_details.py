@@ -70,7 +70,7 @@ def test_of_too_many_segments_the_first_and_the_last_ones_are_kept():
         np.testing.assert_array_equal(got, whole.tau[index][np.array(ends)])
 
 
-@pytest.mark.parametrize("settings", [pytest.param(PAPER, marks=pytest.mark.slow), TREE])
+@pytest.mark.parametrize("settings", [PAPER, TREE])
 @pytest.mark.slow
 def test_segments_end_where_the_next_ones_begin(settings):
     paths = _trace(

@@ -46,20 +46,13 @@ def _objects():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "body", ["tinted box", *(pytest.param(b, marks=pytest.mark.slow) for b in ("ball", "box"))]
-)
+@pytest.mark.parametrize("body", ["tinted box", "ball", "box"])
 @pytest.mark.parametrize(
     "settings",
     [
         PathSettings(_DEPTH, "all", min_throughput=0.02),
-        *(
-            pytest.param(settings, marks=pytest.mark.slow)
-            for settings in (
-                PathSettings(_DEPTH, "first"),
-                PathSettings(_DEPTH, "none", total_reflection="ended"),
-            )
-        ),
+        PathSettings(_DEPTH, "first"),
+        PathSettings(_DEPTH, "none", total_reflection="ended"),
     ],
 )
 def test_both_tracers_find_the_same_paths(body, settings):

@@ -281,13 +281,13 @@ def test_the_light_of_a_ray_is_shared_among_its_paths(priorities):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rule", [pytest.param("nested", marks=pytest.mark.slow), "priority"])
+@pytest.mark.parametrize("rule", ["nested", "priority"])
 @pytest.mark.parametrize(
     ("start", "slots"),
     [
         ((0.1, 0.2, -0.1), {0, 1}),
-        pytest.param((0.1, -0.8, 0.1), {0}, marks=pytest.mark.slow),
-        pytest.param((2.0, 0, 0), set(), marks=pytest.mark.slow),
+        ((0.1, -0.8, 0.1), {0}),
+        ((2.0, 0, 0), set()),
     ],
 )
 def test_a_camera_inside_of_balls(rule, start, slots):

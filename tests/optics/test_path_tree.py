@@ -216,8 +216,8 @@ def test_untinted_light_is_conserved(settings):
 @pytest.mark.parametrize(
     "short_of",
     [
-        pytest.param("live_per_ray", marks=pytest.mark.slow),
-        pytest.param("segments_per_ray", marks=pytest.mark.slow),
+        "live_per_ray",
+        "segments_per_ray",
         "paths_per_ray",
     ],
 )

@@ -191,7 +191,7 @@ def vase():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["vase", pytest.param("ring", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["vase", "ring"])
 def test_revolution_as_a_shape(name, vase):
     shape = vase if name == "vase" else fit_revolution(_body(name)[0])
     assert len(shape.start()) == 40
@@ -251,9 +251,9 @@ def _bottle(*, sides, ridges, lump=0.0):
 @pytest.mark.parametrize(
     ("sides", "ridges", "lump", "furthest"),
     [
-        pytest.param(5, 0.3, 0.0, 0.04, marks=pytest.mark.slow),
+        (5, 0.3, 0.0, 0.04),
         (5, 0.3, 0.3, 0.04),
-        pytest.param(5, 0.1, 0.3, 0.03, marks=pytest.mark.slow),
+        (5, 0.1, 0.3, 0.03),
         (3, 0.2, 0.0, 0.03),
     ],
 )

@@ -73,7 +73,7 @@ def test_faint_paths_have_one_tap():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [pytest.param(40, marks=pytest.mark.slow), 400])
+@pytest.mark.parametrize("count", [40, 400])
 def test_the_radiance_may_be_linear_in_the_direction(count):
     domain, rays = _DOMAINS["spherical"], _rays(count)
     lookups, plain = _lookups(domain, rays, axes=3), _lookups(domain, rays)

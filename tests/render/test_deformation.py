@@ -121,9 +121,7 @@ def test_without_offsets_a_ray_is_straight(kind, space):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "kind", ["raydef", pytest.param("raydef_polyline", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("kind", ["raydef", "raydef_polyline"])
 def test_an_untrained_ray_is_nearly_straight(kind):
     config = _config(kind)
     params = jax.jit(lambda: init_params(jax.random.key(3), config))()

@@ -40,7 +40,7 @@ def test_an_image_has_the_shape_of_its_rays(whole):
     np.testing.assert_allclose(whole.accumulation, 1.0, atol=1e-5)
 
 
-@pytest.mark.parametrize("chunk", [64, pytest.param(100, marks=pytest.mark.slow), 1000])
+@pytest.mark.parametrize("chunk", [64, 100, 1000])
 @pytest.mark.slow
 def test_the_size_of_a_chunk_does_not_matter(model, rays, whole, chunk):
     pieces = render_image(model, rays, chunk=chunk)

@@ -75,7 +75,7 @@ def test_an_image_has_the_shape_of_its_rays(whole):
 
 @pytest.mark.parametrize(
     "settings",
-    [STRAIGHT, pytest.param(PAPER, marks=pytest.mark.slow), TREE],
+    [STRAIGHT, PAPER, TREE],
     ids=["straight", "paper", "tree"],
 )
 @pytest.mark.slow

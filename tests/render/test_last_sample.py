@@ -108,11 +108,11 @@ def _painted(config, fog):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("multisamples", [pytest.param(1, marks=pytest.mark.slow), 6])
+@pytest.mark.parametrize("multisamples", [1, 6])
 @pytest.mark.parametrize("offset", [-0.4, 0.0, 0.3])
 @pytest.mark.parametrize(
     ("space", "order"),
-    [("bounded", np.inf), pytest.param("spherical", 2, marks=pytest.mark.slow)],
+    [("bounded", np.inf), ("spherical", 2)],
 )
 def test_a_painted_wall_is_seen_exactly(monkeypatch, space, order, offset, multisamples):
     config = dataclasses.replace(_END, space=space, multisamples=multisamples, samples=2)
@@ -143,7 +143,7 @@ def _distances(monkeypatch, config, path, *, fog=0.0):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("samples", [pytest.param(2, marks=pytest.mark.slow), 5])
+@pytest.mark.parametrize("samples", [2, 5])
 @pytest.mark.parametrize(("space", "order"), [("bounded", np.inf), ("spherical", 2)])
 def test_a_wall_is_as_far_as_the_end_of_the_path(monkeypatch, space, order, samples):
     config = dataclasses.replace(_END, space=space, samples=samples)
@@ -235,7 +235,7 @@ def _brightness(config):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("multisamples", [pytest.param(1, marks=pytest.mark.slow), 6])
+@pytest.mark.parametrize("multisamples", [1, 6])
 @pytest.mark.parametrize("distance", [0.0, 7.5, 300.0])
 def test_values_and_gradients_are_finite_wherever_the_camera_is(distance, multisamples):
     config = dataclasses.replace(_END, multisamples=multisamples)

@@ -169,7 +169,7 @@ def as_sub_space(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("last_sample", [pytest.param("middle", marks=pytest.mark.slow), "end"])
+@pytest.mark.parametrize("last_sample", ["middle", "end"])
 def test_one_sub_space_equals_the_plain_field(as_sub_space, last_sample):
     config = dataclasses.replace(MODEL, last_sample=last_sample)
     params = _trained(config)
@@ -279,7 +279,7 @@ def test_light_of_a_backdrop_passes_through_each_sub_space_by_itself(planted):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "settings",
-    [STRAIGHT, pytest.param(TREE, marks=pytest.mark.slow)],
+    [STRAIGHT, TREE],
     ids=["straight", "tree"],
 )
 def test_it_renders_along_straight_and_bent_paths(settings):

@@ -138,9 +138,9 @@ def test_the_end_of_the_training_is_the_default_progress():
     ("config", "settings"),
     [
         pytest.param(_CONFIG, STRAIGHT, id="neus-straight"),
-        pytest.param(_CONFIG, TREE, marks=pytest.mark.slow, id="neus-tree"),
-        pytest.param(_UNISURF, STRAIGHT, marks=pytest.mark.slow, id="unisurf-straight"),
-        pytest.param(_UNISURF, TREE, marks=pytest.mark.slow, id="unisurf-tree"),
+        pytest.param(_CONFIG, TREE, id="neus-tree"),
+        pytest.param(_UNISURF, STRAIGHT, id="unisurf-straight"),
+        pytest.param(_UNISURF, TREE, id="unisurf-tree"),
     ],
 )
 def test_it_renders_along_straight_and_bent_paths(config, settings):

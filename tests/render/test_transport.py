@@ -195,7 +195,7 @@ def test_histograms_are_sorted_and_hold_all_light(interior):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("some", [(1,), pytest.param((0, 2, 3), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("some", [(1,), (0, 2, 3)])
 def test_rendering_many_paths_is_a_loop(some):
     paths = _some_paths()
     together = _render(_CLEAR, paths)

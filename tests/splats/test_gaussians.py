@@ -147,7 +147,7 @@ def test_projection_is_that_of_matrices():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kernel", [pytest.param("classic", marks=pytest.mark.slow), "mip"])
+@pytest.mark.parametrize("kernel", ["classic", "mip"])
 def test_derivatives_are_those_of_differences(kernel):
     def smooth(*leaves):
         found = splats.project_all(Gaussians(*leaves), view, **_SIZE, kernel=kernel)

@@ -181,9 +181,7 @@ def test_creases_of_an_open_mesh_are_refused():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "wrong", [{"shift": (30.0, 0.0, 0.0)}, pytest.param({"size": 0.02}, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("wrong", [{"shift": (30.0, 0.0, 0.0)}, {"size": 0.02}])
 def test_an_object_that_is_elsewhere_is_refused(tmp_path, monkeypatch, wrong):
     scene = write_scene(tmp_path / "cube_smcvx_ball", size=64)
     monkeypatch.setattr(index_stage, "learn_backdrop", None)  # would raise
