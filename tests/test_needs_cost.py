@@ -68,6 +68,7 @@ def _training_programs(scene, settings):
     return _tracing(scene, settings) + _surveying(scene, settings)
 
 
+@pytest.mark.slow
 def test_no_mesh_compiles_no_tracer():
     empty = _settings(_analysis())
     tracer = _training_programs(scenes.build(_BALL), TREE)

@@ -9,11 +9,13 @@ from benchmarks.stability.measures import MEASURES
 pytestmark = pytest.mark.longest
 
 
-# What index-matched bodies and the white furnace trace as well, double precision, what
+# What the white furnace traces as well, double precision, what
 # `tests/geometry/test_hit_robustness.py` has of single hits, and scales beside powers of two.
 _SLOW = (
     "ball",
+    "index-matched bodies",
     "slabs of all ratios and angles",
+    "there and back",
     "ball, float64",
     "slabs of all ratios and angles, float64",
     "offsets 1 to 1e4",

@@ -51,6 +51,7 @@ def _rows(view):
     return object_rows[np.linspace(0, len(object_rows) - 1, _ROWS + 2).astype(int)[1:-1]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", _SCENES, ids=lambda scene: scene.name)
 @pytest.mark.parametrize(("settings", "rule"), _RULES, ids=["straight", "paper", "tree"])
 def test_images_are_those_of_the_slow_tree(scene, settings, rule):

@@ -265,6 +265,7 @@ def test_too_little_is_no_measurement():
             assert fit_background(kind, sample_depths(seen, depths)) is None
 
 
+@pytest.mark.slow
 def test_the_example_of_the_page_runs_and_gives_what_it_says(capsys, monkeypatch):
     page = (ROOT / "docs/data_formats.md").read_text()
     blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)

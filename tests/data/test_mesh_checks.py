@@ -222,6 +222,7 @@ def test_an_overlap_outweighs_nested_parts():
     assert _advice(cup, drink, ball("ice_glass", centre=(1.0, 0.0, 0.0))).rule == "priority"
 
 
+@pytest.mark.slow
 def test_good_priorities_have_no_findings():
     cup = _ranked(1, "cup_glass", radius=3.0)
     ice, drink = _ranked(3, "ice_glass", radius=0.5), _ranked(2, "drink_water")
@@ -394,11 +395,12 @@ def test_blocks_that_nearly_touch(distance, found):
     assert len(_warnings(*parts)) == found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scale", "shift"),
     [
         (1e-4, 30.0),
-        *(pytest.param(scale, 0.0, marks=pytest.mark.slow) for scale in (1.0, 1e4)),
+        *((scale, 0.0) for scale in (1.0, 1e4)),
     ],
 )
 def test_findings_know_no_size(scale, shift):

@@ -241,7 +241,10 @@ def _gradient(name):
     return jax.jit(jax.grad(total, argnums=(0, 1, 2)))
 
 
-@pytest.mark.parametrize("name", _CONFIGS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=pytest.mark.slow if "nerfacto" in name else ()) for name in _CONFIGS],
+)
 @pytest.mark.parametrize("scale", [0.0, 0.01, 1e30])
 def test_gradients_are_finite_at_the_corners_of_the_cube(name, scale):
     for positions in (_CORNERS[:6], _CORNERS[2:]):

@@ -250,6 +250,7 @@ def test_gradients_are_finite(position, scale):
     assert gradients.all_finite(got)
 
 
+@pytest.mark.slow
 def test_check_grads():
     def features(tables, position, scale):
         params = {"params": {f"hash_table_{i:02d}": table for i, table in enumerate(tables)}}

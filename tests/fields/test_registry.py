@@ -62,6 +62,7 @@ def fog(monkeypatch):
     monkeypatch.setitem(registry.KINDS, "fog", _FOG)
 
 
+@pytest.mark.slow
 def test_a_third_kind_is_rendered_saved_and_sized(fog, tmp_path):
     model = PRESETS["tiny"].model(_BOUNDS, "field", field="fog")
     assert samples_of(model) == (8, 6, 4, 2)

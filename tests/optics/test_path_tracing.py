@@ -253,6 +253,7 @@ def test_the_paper_reflects_once_at_the_first_surface():
     np.testing.assert_array_equal(paths.media[1, :2], [AMBIENT, AMBIENT])
 
 
+@pytest.mark.slow
 def test_fresnel_uses_the_index_of_the_part_that_was_hit():
     diamond = scenes.box((1.0, 1.0, 1.0), index=2.418, name="a_diamond")
     glass = scenes.ball(0.5, index=1.5, centre=(5.0, 0.0, 0.0), name="b_glass")

@@ -365,6 +365,7 @@ def test_the_index_is_found_from_a_wrong_start(world, ball, true):
     assert told[-1] == (most, most)
 
 
+@pytest.mark.slow
 def test_a_ball_that_is_a_little_off_returns(world):
     off = Sphere(np.array([0.01, -0.006, 0.008]), 1.01)
     model = SingleObject(off, 1.48)
@@ -612,6 +613,7 @@ def test_saturated_and_unseen_pixels_lose_their_weight(world, glass, seen):
     assert np.linalg.norm(hidden.gradient) < 0.1 * np.sqrt(np.trace(hidden.matrix) * len(covered))
 
 
+@pytest.mark.slow
 def test_degenerate_faces_harm_nothing(world, ball, seen):
     mesh = _ball_mesh(ball)
     one, two = mesh.faces[:2, 0]

@@ -146,6 +146,7 @@ def test_moved_samples_are_those_of_a_moved_ray():
     assert np.max(apart) > 1e-3
 
 
+@pytest.mark.slow
 def test_a_turned_sample_is_seen_from_elsewhere():
     """The density stays, and the colour is that of the turned direction."""
     config = _config("raydef")

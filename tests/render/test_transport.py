@@ -234,6 +234,7 @@ def _walk(path, t, *, interior):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("interior", _MODELS)
 def test_intervals_are_marked_by_where_their_middle_lies(interior):
     config = _MODELS[interior]
@@ -353,6 +354,7 @@ def test_what_hides_in_an_object_is_seen_by_the_field_interior_only(plant):
         np.testing.assert_allclose(seen.composite.median[0], expected, atol=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("interior", _MODELS)
 def test_colour_is_asked_with_the_direction_at_the_middle_of_an_interval(plant, interior):
     paths = [_tree_item(_some_paths(), index) for index in range(4)]

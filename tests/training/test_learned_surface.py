@@ -63,6 +63,7 @@ def test_a_surface_begins_from_meshes():
         np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.slow
 def test_samples_of_meshes_have_their_distances():
     surfaces = jax.device_get(_ball_scene().surfaces)
     found = learned_surface.sample_meshes(

@@ -203,6 +203,7 @@ def test_paths_that_are_kept_train_like_paths_that_are_traced_anew():
     _assert_identical(kept_reports, traced_reports)
 
 
+@pytest.mark.slow
 def test_paths_are_not_kept_for_a_run_of_one_epoch():
     schedule = dataclasses.replace(CONFIG.schedule, steps=1)
     assert _setup(dataclasses.replace(CONFIG, schedule=schedule)).epoch is None

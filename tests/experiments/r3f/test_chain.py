@@ -344,9 +344,8 @@ def test_where_light_explains_no_more_the_surface_stays_and_the_reason_is_told(s
     assert chosen is masks and "no shape explains the judges significantly better" in remark
 
 
-@pytest.mark.parametrize(
-    ("after", "kept"), [(0.03, True), pytest.param(0.05, False, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("after", "kept"), [(0.03, True), (0.05, False)])
 def test_light_is_kept_only_where_validation_views_say_so(
     scene, whole, tmp_path, monkeypatch, after, kept
 ):
