@@ -13,6 +13,7 @@ The leaves of a tree of dataclasses can be options (`option`), which are accesse
 import collections
 import dataclasses
 import difflib
+import functools
 import json
 import math
 import numbers
@@ -179,7 +180,7 @@ def convert_fields(record: Any) -> None:
       ValueError: if a value has another type; the message names the field, or the `name` in its
         metadata.
     """
-    hints = hints_of(type(record))
+    hints = hints_of(record.__class__)
     for field in dataclasses.fields(record):
         value, kind = getattr(record, field.name), hints[field.name]
         name = field.metadata.get("name") or field.name
@@ -195,7 +196,8 @@ def nearest(word: str, words: Iterable[str], *, similarity: float = 0.6) -> str 
     return found[0] if found else None
 
 
-def hints_of(owner: Any) -> dict[str, Any]:
+@functools.cache
+def hints_of(owner: Any) -> Mapping[str, Any]:
     """Returns the annotations of a class by field."""
     return typing.get_type_hints(owner)
 
@@ -266,11 +268,11 @@ def options_of(kind: type) -> Iterator[Option]:
 
 def type_of(kind: type, chosen: Option) -> Any:
     """Returns the annotation of the field of an option of a configuration class."""
-    hints = hints_of(kind)
-    owner = hints[chosen.section] if chosen.section else kind
+    owner = hints_of(kind)[chosen.section] if chosen.section else kind
     return hints_of(owner)[chosen.field.name]
 
 
+@functools.cache
 def present_name(kind: type, name: str) -> str:
     """Returns the name of an option for its name in this or an earlier version."""
     former = {each.field.metadata.get(FORMERLY): each.name for each in options_of(kind)}
@@ -296,9 +298,8 @@ def convert_options(kind: type, given: Mapping[str, Any]) -> dict[str, Any]:
         raise ValueError(
             f"There is no option {unknown[0]!r}. Choose from {', '.join(sorted(options))}."
         )
-    usual = {name: options[name].field.default for name in given}
     return {
-        name: usual[name]
+        name: options[name].field.default
         if value is None
         else convert(plain(value), type_of(kind, options[name]), name=name)
         for name, value in given.items()
@@ -371,7 +372,7 @@ def _build_dataclass(kind: Any, value: Any, where: str, variants: Variants) -> A
     if not isinstance(value, dict):
         raise ValueError(f"{where} is {abridged(value)}, not an object")
     kind = _variant(variants[kind], value, where) if kind in variants else kind
-    hints = typing.get_type_hints(kind)
+    hints = hints_of(kind)
     fields = dataclasses.fields(kind)
     value = _with_present_names(fields, value)
     names = [field.name for field in fields if field.name in value]

@@ -419,12 +419,17 @@ class TrainConfig:
 
         Nothing else changes. The arguments and errors are those of `override`.
         """
-        options, overrides = _OPTIONS, self.overrides()
-        chosen = tuple(name for name in options if name in overrides)
-        config = dataclasses.replace(self, chosen=chosen)
+        overrides, sections = self.overrides(), dict[str, dict[str, Any]]()
         for name, value in _converted(values).items():
-            config = config._with(options[name], value)
-        return config
+            option = _OPTIONS[name]
+            sections.setdefault(option.section, {})[option.field.name] = value
+        own = sections.pop("", {})
+        changed = {
+            section: dataclasses.replace(getattr(self, section), **new)
+            for section, new in sections.items()
+        }
+        chosen = tuple(name for name in _OPTIONS if name in overrides)
+        return dataclasses.replace(self, chosen=chosen, **own, **changed)
 
     def overrides(self) -> frozenset[str]:
         """Returns the names of the options that are overrides.
@@ -462,12 +467,6 @@ class TrainConfig:
         option = _OPTIONS[name]
         section = getattr(self, option.section) if option.section else self
         return getattr(section, option.field.name)
-
-    def _with(self, option: Option, value: Any) -> "TrainConfig":
-        new, section = {option.field.name: value}, option.section
-        if section:
-            new = {section: dataclasses.replace(getattr(self, section), **new)}
-        return dataclasses.replace(self, **new)
 
 
 def type_of(option: Option) -> Any:
