@@ -520,7 +520,8 @@ def _copy(target: Path) -> Path:
 
 
 def _run(copy: Path, tests: tuple[str, ...] | list[str]) -> subprocess.CompletedProcess:
-    options = ["-x", "-q", "-p", "no:cacheprovider", *(f"tests/{test}" for test in tests)]
+    options = ["-x", "-q", "-p", "no:cacheprovider", "-m", "slow or not slow"]
+    options += [f"tests/{test}" for test in tests]
     # Copies share what they compile; a bug compiles anew what it changes.
     shared = {"JAX_COMPILATION_CACHE_DIR": str(copy.parent / "compiled")}
     return subprocess.run(

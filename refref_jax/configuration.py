@@ -199,7 +199,7 @@ def nearest(word: str, words: Iterable[str], *, similarity: float = 0.6) -> str 
 @functools.cache
 def hints_of(owner: Any) -> Mapping[str, Any]:
     """Returns the annotations of a class by field."""
-    return typing.get_type_hints(owner)
+    return types.MappingProxyType(typing.get_type_hints(owner))
 
 
 def plain(value: Any) -> Any:

@@ -19,7 +19,11 @@ def _public(kind):
     found = []
     for module in _MODULES:
         for name, value in vars(module).items():
-            if kind(value) and value.__module__ == module.__name__ and not name.startswith("_"):
+            if (
+                kind(inspect.unwrap(value))
+                and value.__module__ == module.__name__
+                and not name.startswith("_")
+            ):
                 found.append(value)
     return found
 

@@ -13,9 +13,9 @@ import pytest
 from benchmarks.ahead_of_time import compile as ahead_of_time
 from benchmarks.ahead_of_time import counters, hopper, programs
 
-pytestmark = pytest.mark.slow
-
-_each_platform = pytest.mark.parametrize("platform", ["cuda", "tpu"])
+_each_platform = pytest.mark.parametrize(
+    "platform", ["cuda", pytest.param("tpu", marks=pytest.mark.slow)]
+)
 
 
 def _lowered(program):
@@ -64,6 +64,7 @@ def test_tracing_has_no_product_that_a_device_would_round(training, platform):
     assert not _refused(text) and not _dots(text)
 
 
+@pytest.mark.slow
 @_each_platform
 def test_products_of_a_step_are_those_of_networks_or_have_all_digits(training, platform):
     text = training[1](platform)
@@ -80,6 +81,7 @@ def test_products_of_the_solver_of_backdrops_have_all_digits(platform):
     assert [name for name, pinned in _dots(text) if pinned != 2] == []
 
 
+@pytest.mark.slow
 def test_off_cpus_all_rays_of_a_pool_are_one_block(of_tiny, training):
     _, rays = of_tiny[0].arguments
     pool = f"tensor<{rays.radii.size}x3xf32>"

@@ -182,7 +182,7 @@ def _traced_operations(material):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(name, marks=() if name == "opaque" else pytest.mark.slow) for name in _MATERIALS],
+    _MATERIALS,
 )
 def test_each_material_costs_operations_only_where_a_part_has_it(name):
     material, needed = _MATERIALS[name]
@@ -196,7 +196,6 @@ def test_each_material_costs_operations_only_where_a_part_has_it(name):
     assert operations > fewest
 
 
-@pytest.mark.slow
 def test_a_clear_smooth_scene_of_one_index_compiles_to_as_much_as_before_the_materials():
     if jax.__version__ != "0.10.2":
         pytest.skip("operations were counted with jax 0.10.2")

@@ -9,12 +9,11 @@ from benchmarks.stability.measures import MEASURES
 pytestmark = pytest.mark.longest
 
 
-# What the white furnace traces as well, double precision, what
+# Whole paths whose single interfaces are quick, double precision, what
 # `tests/geometry/test_hit_robustness.py` has of single hits, and scales beside powers of two.
 _SLOW = (
     "ball",
     "index-matched bodies",
-    "slabs of all ratios and angles",
     "there and back",
     "ball, float64",
     "slabs of all ratios and angles, float64",

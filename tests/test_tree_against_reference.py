@@ -34,8 +34,8 @@ _ROWS = 8
 _VIEWS = (0, 10)
 
 _RULES = [
-    pytest.param(path_settings.STRAIGHT, reference_tree.STRAIGHT, marks=pytest.mark.slow),
-    pytest.param(path_settings.PAPER, reference_tree.PAPER, marks=pytest.mark.slow),
+    (path_settings.STRAIGHT, reference_tree.STRAIGHT),
+    (path_settings.PAPER, reference_tree.PAPER),
     (path_settings.TREE, reference_tree.TREE),
 ]
 

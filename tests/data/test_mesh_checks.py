@@ -222,7 +222,6 @@ def test_an_overlap_outweighs_nested_parts():
     assert _advice(cup, drink, ball("ice_glass", centre=(1.0, 0.0, 0.0))).rule == "priority"
 
 
-@pytest.mark.slow
 def test_good_priorities_have_no_findings():
     cup = _ranked(1, "cup_glass", radius=3.0)
     ice, drink = _ranked(3, "ice_glass", radius=0.5), _ranked(2, "drink_water")

@@ -125,7 +125,6 @@ def test_equal_priorities_of_an_overlap_are_warned_of():
         assemble(parts, rule="priority")
 
 
-@pytest.mark.slow
 def test_overlaps_that_the_rule_is_for_are_not_warned_of():
     parts = [ball("ice")._replace(priority=2), ball("drink", centre=(0.5, 0.0, 0.0))]
     with warnings.catch_warnings():

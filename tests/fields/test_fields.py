@@ -264,7 +264,7 @@ def test_gradients_reach_every_layer_and_table(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("transformation", transformations.ALL)
-@_few("density", "radiance", "nerfacto radiance with a skip")
+@pytest.mark.parametrize("name", _CONFIGS)
 def test_transformations_change_nothing(name, transformation):
     gaussians = jax.tree.map(lambda *x: jnp.stack(x), *(_gaussians(seed=seed) for seed in range(3)))
     directions = jnp.stack([_direction(seed) for seed in range(3)])
@@ -296,7 +296,7 @@ def _taught(name, precision, params, gaussians):
 
 
 @pytest.mark.slow
-@_few("density", "radiance")
+@pytest.mark.parametrize("name", _CONFIGS)
 def test_half_precision_is_near_single_precision(name):
     single, single_slopes = _taught(name, "float32", _parameters(name), _gaussians())
     half, half_slopes = _taught(name, "bfloat16", _parameters(name), _gaussians())

@@ -172,8 +172,7 @@ def test_a_ray_that_is_not_finite_hits_nothing_and_harms_no_other(broken):
     np.testing.assert_array_equal(np.isfinite(distances), whole)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("platform", ["cuda", "tpu"])
+@pytest.mark.parametrize("platform", ["cuda", pytest.param("tpu", marks=pytest.mark.slow)])
 def test_the_traversal_lowers_for_accelerators(platform):
     tree, _ = bvh_build.build(trimesh.creation.icosphere(subdivisions=1).triangles.astype("f4"))
     rays = Rays(jnp.zeros((32, 3)), jnp.ones((32, 3)), jnp.zeros(32))

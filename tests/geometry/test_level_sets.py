@@ -96,7 +96,6 @@ def test_hits_of_a_torus_are_roots_of_its_quartic():
     np.testing.assert_allclose(distances[both], exact[both], atol=1e-9)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("factor", [1.0, 3.0])
 def test_the_gradient_of_a_hit_is_the_closed_form(factor):
     origins, directions = _rays(40, seed=2)

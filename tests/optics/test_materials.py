@@ -139,7 +139,6 @@ def _sheets(material, glass):
     return scenes.build(glass, _sheet(material=material), _moved(_sheet(material=other), 0, 40, 0))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("around", [1.0, 1.5])
 def test_a_conductor_reflects_by_its_index_relative_to_the_medium(around):
     metal = Material("conductor", complex_index=_GOLD)

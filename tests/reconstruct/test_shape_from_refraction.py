@@ -264,7 +264,6 @@ def _slopes_of(candidate, surface, rays):
     return np.asarray(slopes).reshape(-1, 3), found
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "step", "off"),
     [

@@ -36,14 +36,8 @@ _SCENES = {
 }
 
 
-# The most paths to render one by one, uncompiled.
-_SLOW = ("glass ball, path tree", "water in glass, learned tints")
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in _SLOW)) for name in _SCENES]
-)
+@pytest.mark.parametrize("name", _SCENES)
 def test_render_ray_equals_render_rays(name, monkeypatch):
     config, settings, parts = _SCENES[name]
     model = Model(config, settings, scenes.build(*parts), _params(config))

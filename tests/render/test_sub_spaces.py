@@ -212,7 +212,6 @@ def _with_densities(params, raw):
     return jax.tree.map(jnp.asarray, tree)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("size", [1e-4, 0.6, 100.0])
 @pytest.mark.parametrize(
     "raw", [(-1e10,) * 3, (1e10,) * 3, (-1e10, 1e10, 0.0), (0.0, 1e5, -1e5)], ids=str

@@ -185,7 +185,6 @@ def _slopes_of_all(values, *, kernel):
     return sum(map(jnp.sum, found)), found
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", _EXTREMES)
 @pytest.mark.parametrize("kernel", ["classic", "mip"])
 def test_projection_is_finite_and_so_are_its_derivatives(name, kernel):

@@ -37,6 +37,9 @@ def form(request, monkeypatch):
     return request.param
 
 
+_each_form = pytest.mark.parametrize("form", _FORMS, indirect=True)
+
+
 def _often(name):
     """Every run of the suite tests one form, and slow ones the other."""
     marks = {each: () if each == name else pytest.mark.slow for each in _FORMS}
@@ -123,7 +126,7 @@ def test_the_derivatives_are_those_of_a_plain_blend(form, scene):
 
 
 @pytest.mark.slow
-@_often("native")
+@_each_form
 def test_the_derivatives_of_gaussians_are_those_of_float64(form, scene):
     """From the reference's derivatives of the features, through the projection in float64."""
     values, view, _, visible, exact, (image, left, visits) = scene
@@ -150,7 +153,7 @@ def test_the_derivatives_of_gaussians_are_those_of_float64(form, scene):
 
 
 @pytest.mark.slow
-@_often("native")
+@_each_form
 def test_one_gaussian_by_hand(form):
     scale, depth, focal = 0.1, 2.0, 20.0
     seen = _image(made_splats.one((0, 0, depth), opacity=0.8))
@@ -167,7 +170,7 @@ def test_one_gaussian_by_hand(form):
 
 
 @pytest.mark.slow
-@_often("native")
+@_each_form
 def test_pixels_of_three_gaussians_by_hand(form):
     """Numbers of gsplat's projection and a plain blend, to six decimals."""
     values = made_splats.joined(
@@ -198,7 +201,7 @@ def test_pixels_of_three_gaussians_by_hand(form):
 
 
 @pytest.mark.slow
-@_often("native")
+@_each_form
 def test_the_nearer_of_two_planes_is_in_front(form):
     near = made_splats.one((0, 0, 2), scale=(5, 5, 0.01), opacity=0.75, colour=(1, 0, 0))
     far = made_splats.one((0, 0, 3), scale=(5, 5, 0.01), opacity=0.75, colour=(0, 1, 0))
@@ -209,7 +212,7 @@ def test_the_nearer_of_two_planes_is_in_front(form):
 
 
 @pytest.mark.slow
-@_often("native")
+@_each_form
 def test_weights_and_transmittance_add_up_to_one(form, scene):
     values, view, *_ = scene
     white = values._replace(
@@ -223,7 +226,7 @@ def test_weights_and_transmittance_add_up_to_one(form, scene):
 
 
 @pytest.mark.slow
-@_often("native")
+@_each_form
 def test_the_order_of_gaussians_does_not_matter(form, scene):
     values, view, *_ = scene
     order = np.random.default_rng(3).permutation(300)
@@ -254,7 +257,7 @@ def test_moving_scene_and_camera_together_changes_nothing(form):
 
 
 @pytest.mark.slow
-@_often("native")
+@_each_form
 def test_an_image_depends_on_neither_tiles_nor_capacity(form, scene):
     values, view, *_ = scene
     found = _PROJECT(values, view)
@@ -273,7 +276,7 @@ def _listed(projected, capacity):
 
 
 @pytest.mark.slow
-@_often("native")
+@_each_form
 def test_lists_report_what_they_need(form):
     found = _PROJECT(made_splats.gaussians(300), made_splats.view())
     total = int(images.count_entries(found, _GRID))
@@ -314,7 +317,7 @@ def test_both_lists_are_equal():
 
 
 @pytest.mark.slow
-@_often("native")
+@_each_form
 def test_no_gaussians_and_empty_tiles(form):
     none = _image(splats.blank(0))
     assert np.all(none.transmittance == 1.0) and not np.any(none.colours)
@@ -345,7 +348,7 @@ def test_a_list_longer_than_a_chunk(form):
 
 
 @pytest.mark.slow
-@_often("native")
+@_each_form
 def test_opaque_gaussians_keep_a_thousandth_and_have_finite_derivatives(form):
     values = made_splats.joined(
         made_splats.one((0, 0, 2), scale=50, opacity=1.0),

@@ -191,7 +191,6 @@ def test_colours_above_white_are_drawn_back_unless_a_pixel_is_saturated(
     assert np.all(extremes.colour_bias(moved) <= 9.0)
 
 
-@pytest.mark.slow
 @_each_precision
 @pytest.mark.parametrize(("raw", "target"), [(8.0, 0), (-8.0, 255)])
 def test_a_wrong_colour_beyond_what_an_image_holds_can_still_turn(raw, target, precision):

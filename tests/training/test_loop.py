@@ -106,7 +106,6 @@ class _ParamsOfBefore(NamedTuple):
     dyes: Any
 
 
-@pytest.mark.slow
 def test_a_checkpoint_of_an_earlier_version_is_read(tmp_path):
     config = dataclasses.replace(MODEL, interior="absorbing", learned_tints=2)
     state = init_state(CONFIG.seed, config, CONFIG.schedule)
@@ -121,8 +120,7 @@ def test_a_checkpoint_of_an_earlier_version_is_read(tmp_path):
         _assert_identical(checkpoints.restore(state), state)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("every", [(3,), (4,), (10, 5)])
+@pytest.mark.parametrize("every", [pytest.param((3,), marks=pytest.mark.slow), (4,), (10, 5)])
 def test_steps_taken_at_once_are_the_same_steps(every):
     one_by_one = {
         int(state.step): jax.device_get((state, report))

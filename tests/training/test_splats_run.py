@@ -24,7 +24,7 @@ from tests.factories.small_model import CAMERAS
 from tests.laws import expectations, runs
 from tests.processes.command import ROOT, run_command
 
-pytestmark = [pytest.mark.loose, pytest.mark.longest, pytest.mark.slow]
+pytestmark = [pytest.mark.loose, pytest.mark.longest]
 
 _SCENE = ROOT / "experiments" / "data" / "cube_smcvx_ball"
 _PERIODS = fit.Periods(log=5, checkpoint=10)
@@ -60,6 +60,7 @@ def test_the_script_of_the_readme_trains_splats_and_renders_them(script):
     assert view.shape == (16, 16, 3) and view.std() > 0.0
 
 
+@pytest.mark.slow
 def test_the_configuration_of_a_run_repeats_it_bit_for_bit(script, trained):
     runs.assert_repeats(script, *trained)
 
@@ -68,6 +69,7 @@ def test_a_model_is_loaded_without_a_word_and_nothing_is_written(script, caplog,
     runs.assert_loads_quietly(script, 20, caplog, capfd)
 
 
+@pytest.mark.slow
 def test_a_run_has_metrics_and_a_complete_configuration(trained):
     lines = run_folder.read_metrics(trained[1])
     assert [line["step"] for line in lines] == [5, 10, 15, 20]
@@ -78,6 +80,7 @@ def test_a_run_has_metrics_and_a_complete_configuration(trained):
     assert (config.model.gaussians, config.model.splat_filter) == (500, "mip")
 
 
+@pytest.mark.slow
 def test_a_checkpoint_is_read_as_it_was_written(trained):
     made, run = trained
     read = checkpoint_io.load_model(run)
@@ -96,6 +99,7 @@ def test_a_stopped_run_is_resumed_bit_for_bit(trained, tmp_path):
     expectations.assert_same(resumed.params, trained[0].params)
 
 
+@pytest.mark.slow
 def test_images_are_rendered_and_smaller_pixels_average_to_them(trained):
     model = trained[0]
     seen = images.render_camera(model, CAMERAS, 0)
@@ -134,6 +138,7 @@ def test_the_viewer_draws_the_error_of_a_test_view(trained):
     assert error == pytest.approx(np.sqrt(np.mean(np.square(seen - true))), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_what_needs_rays_or_a_field_is_refused_in_one_sentence(trained):
     model = trained[0]
     rays = image_rays(CAMERAS, 0)

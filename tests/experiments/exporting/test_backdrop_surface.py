@@ -21,13 +21,6 @@ _SIDE = 16
 _each_space = pytest.mark.parametrize(
     "space", ["bounded", pytest.param("spherical", marks=pytest.mark.slow), "unbounded"]
 )
-_often_bounded = pytest.mark.parametrize(
-    "space",
-    [
-        "bounded",
-        *(pytest.param(each, marks=pytest.mark.slow) for each in ("spherical", "unbounded")),
-    ],
-)
 
 
 def _model(space):
@@ -79,7 +72,7 @@ def _bilinear(image, uv):
 
 
 @pytest.mark.slow
-@_often_bounded
+@pytest.mark.parametrize("space", ["bounded", "spherical", "unbounded"])
 def test_rays_into_the_textured_mesh_see_the_backdrop(space, tmp_path):
     model, domain = _model(space), Domain(2.0, space, (0.1, -0.2, 0.3))
     path = tmp_path / "room.glb"

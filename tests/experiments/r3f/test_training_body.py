@@ -9,7 +9,7 @@ from experiments.r3f.records import ReconstructionConfig
 from tests.factories.silhouettes import write_scene
 from tests.processes.command import run_command, run_module
 
-pytestmark = [pytest.mark.longest, pytest.mark.slow]
+pytestmark = pytest.mark.longest
 
 _GRID = "--resolution=20"
 
