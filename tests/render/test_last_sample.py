@@ -185,7 +185,6 @@ def test_all_multisamples_of_the_end_lie_in_a_wall_that_is_met_head_on():
     np.testing.assert_allclose(radii, _RADIUS * arc / np.sqrt(2.0) * 0.5 / MODEL.radius, rtol=1e-3)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("multisamples", [1, 6])
 def test_only_the_last_interval_is_evaluated_elsewhere(multisamples):
     middle, end = (
