@@ -397,10 +397,7 @@ def test_blocks_that_nearly_touch(distance, found):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("scale", "shift"),
-    [
-        (1e-4, 30.0),
-        *((scale, 0.0) for scale in (1.0, 1e4)),
-    ],
+    [(1e-4, 30.0), (1.0, 0.0), (1e4, 0.0)],
 )
 def test_findings_know_no_size(scale, shift):
     def placed(part):

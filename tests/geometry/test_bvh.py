@@ -141,16 +141,7 @@ def test_no_ray_slips_through_a_closed_surface(target, subdivisions):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "count",
-    [
-        1,
-        15,
-        16,
-        17,
-        100,
-    ],
-)
+@pytest.mark.parametrize("count", [1, 15, 16, 17, 100])
 def test_packets_and_lockstep_give_the_same_hits(count):
     triangles = _soup(60)
     origins, directions = _random_rays(count)
@@ -163,16 +154,7 @@ def test_packets_and_lockstep_give_the_same_hits(count):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "faces",
-    [
-        0,
-        1,
-        12,
-        300,
-        1500,
-    ],
-)
+@pytest.mark.parametrize("faces", [0, 1, 12, 300, 1500])
 @pytest.mark.parametrize("lockstep", [False, True])
 def test_spare_rows_change_no_hit(faces, lockstep):
     tree, slots = bvh_build.build(_soup(faces).astype(np.float32))
