@@ -5,9 +5,8 @@ import importlib
 import inspect
 import pkgutil
 
-import pytest
-
 import refref_jax
+from tests.laws.conventions import holds_of_all
 
 _MODULES = [
     importlib.import_module(info.name)
@@ -40,7 +39,7 @@ def test_there_is_something_to_inspect():
     assert len(_FUNCTIONS) > 50 and len(_CLASSES) > 20
 
 
-@pytest.mark.parametrize("function", _FUNCTIONS, ids=_qualified)
+@holds_of_all(_FUNCTIONS, name=_qualified)
 def test_functions_are_documented_and_annotated(function):
     assert inspect.getdoc(function)
     signature = inspect.signature(function)
@@ -49,7 +48,7 @@ def test_functions_are_documented_and_annotated(function):
         assert parameter.annotation is not inspect.Parameter.empty, parameter.name
 
 
-@pytest.mark.parametrize("function", _FUNCTIONS, ids=_qualified)
+@holds_of_all(_FUNCTIONS, name=_qualified)
 def test_options_are_keyword_only_and_the_key_comes_first(function):
     parameters = inspect.signature(function).parameters
     for parameter in parameters.values():
@@ -61,7 +60,7 @@ def test_options_are_keyword_only_and_the_key_comes_first(function):
         assert next(iter(parameters)) == "key"
 
 
-@pytest.mark.parametrize("cls", _CLASSES, ids=_qualified)
+@holds_of_all(_CLASSES, name=_qualified)
 def test_records_are_named_tuples_and_configurations_are_frozen(cls):
     assert inspect.getdoc(cls)
     if dataclasses.is_dataclass(cls):

@@ -3,10 +3,9 @@
 import ast
 from pathlib import Path
 
-import pytest
-
 from benchmarks import planted_bugs
 from tests.laws import syntax
+from tests.laws.conventions import holds_of_all
 
 _ROOT = Path(__file__).parents[1]
 _PACKAGE = _ROOT / "refref_jax"
@@ -73,15 +72,6 @@ def _name(path):
     return path.relative_to(_PACKAGE).as_posix()
 
 
-def _imports(path):
-    """Yields the dotted names that a module imports."""
-    for node in syntax.nodes(path):
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
-
-
 def _late_imports(path):
     """Yields the names of modules that a command imports when they are first used."""
     for node in syntax.nodes(path):
@@ -112,12 +102,12 @@ def _body_lines(function):
     return body[-1].end_lineno - body[0].lineno + 1 if body else 0
 
 
-@pytest.mark.parametrize("path", _MODULES, ids=_name)
+@holds_of_all(_MODULES, name=_name)
 def test_imports_fall(path):
     here = path.relative_to(_PACKAGE).with_suffix("").parts[0]
     if here == "__init__":
         return
-    for name in _imports(path):
+    for name in syntax.imports(path):
         parts = name.split(".")
         if parts[0] != "refref_jax":
             continue
@@ -125,14 +115,14 @@ def test_imports_fall(path):
         assert there == here or _FLOORS[there] < _FLOORS[here], f"{_name(path)} imports {name}"
 
 
-@pytest.mark.parametrize("path", _MODULES, ids=_name)
+@holds_of_all(_MODULES, name=_name)
 def test_the_library_imports_no_command(path):
-    assert not {name.split(".")[0] for name in _imports(path)} & {"experiments", "benchmarks"}
+    assert not {name.split(".")[0] for name in syntax.imports(path)} & {"experiments", "benchmarks"}
 
 
-@pytest.mark.parametrize("path", _BENCHMARKS, ids=lambda path: path.stem)
+@holds_of_all(_BENCHMARKS)
 def test_benchmarks_import_no_test(path):
-    assert "tests" not in {name.split(".")[0] for name in _imports(path)}
+    assert "tests" not in {name.split(".")[0] for name in syntax.imports(path)}
 
 
 def test_what_tests_share_has_its_folders():
@@ -157,7 +147,7 @@ def test_only_the_generator_imports_the_generator():
     generator = _ROOT / "experiments" / "dataset"
     for path in _SCRIPTS + _BENCHMARKS:
         if not path.is_relative_to(generator):
-            for name in (*_imports(path), *_late_imports(path)):
+            for name in (*syntax.imports(path), *_late_imports(path)):
                 assert not f"{name}.".startswith("experiments.dataset."), f"{path} imports {name}"
 
 
@@ -166,7 +156,7 @@ def test_every_module_has_a_floor():
     assert tops - {"__init__"} == set(_FLOORS)
 
 
-@pytest.mark.parametrize("path", [p for p in _MODULES if "data" in p.parts], ids=_name)
+@holds_of_all([path for path in _MODULES if "data" in path.parts], name=_name)
 def test_data_is_numpy_only(path):
     allowed = {
         "geometry.cameras",
@@ -174,27 +164,27 @@ def test_data_is_numpy_only(path):
         "geometry.surfaces",
         "geometry.triangle_meshes",
     }
-    for name in _imports(path):
+    for name in syntax.imports(path):
         assert name.split(".")[0] not in ("jax", "flax", "optax"), name
         if name.startswith("refref_jax.geometry"):
             assert any(name.startswith(f"refref_jax.{module}") for module in allowed), name
 
 
-@pytest.mark.parametrize("path", _MODULES, ids=_name)
+@holds_of_all(_MODULES, name=_name)
 def test_numpy_and_jax_never_meet_in_one_function(path):
     for function in _functions(path):
         names = {node.id for node in ast.walk(function) if isinstance(node, ast.Name)}
         assert not {"np", "jnp"} <= names, f"{function.name} uses both np and jnp"
 
 
-@pytest.mark.parametrize("path", _MODULES, ids=_name)
+@holds_of_all(_MODULES, name=_name)
 def test_only_the_rim_compiles(path):
     if _name(path) not in _MAY_JIT:
         named = [node for node in syntax.nodes(path) if _is_jit(node)]
-        assert not named and "jax.jit" not in _imports(path)
+        assert not named and "jax.jit" not in syntax.imports(path)
 
 
-@pytest.mark.parametrize("path", _MODULES, ids=_name)
+@holds_of_all(_MODULES, name=_name)
 def test_guards_live_in_numerics(path):
     text = path.read_text()
     assert "nan_to_num" not in text
@@ -208,7 +198,7 @@ def test_modules_are_deep():
     assert len(modules) <= _MOST_MODULES
     assert sum(lengths) >= _LEAST_MEAN_LENGTH * len(modules)
     importers = [path for path in modules + _SCRIPTS if path.name != "__init__.py"]
-    imported = {path: set(_imports(path)) for path in importers}
+    imported = {path: set(syntax.imports(path)) for path in importers}
     lonely = [path for path in modules if _count_importers(path, imported) == 1]
     assert len(lonely) <= _MOST_WITH_ONE_IMPORTER, [_name(path) for path in lonely]
 
@@ -222,7 +212,7 @@ def _count_importers(path, imported):
     )
 
 
-@pytest.mark.parametrize("path", _MODULES + _SCRIPTS, ids=lambda p: p.name)
+@holds_of_all(_MODULES + _SCRIPTS)
 def test_modules_and_functions_are_short_and_named(path):
     assert path.stem not in _VAGUE_NAMES
     assert len(path.read_text().splitlines()) <= _LONGEST_MODULE

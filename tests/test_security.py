@@ -18,6 +18,8 @@ from experiments.dataset import check_page
 from refref_jax import atomic_files, metrics
 from refref_jax.data import image_files, meshes
 from refref_jax.render import checkpoint_io
+from tests.laws import syntax
+from tests.laws.conventions import holds_of_all
 from tests.processes.command import ROOT
 
 _MODULES = sorted((*(ROOT / "refref_jax").rglob("*.py"), *(ROOT / "experiments").rglob("*.py")))
@@ -37,7 +39,7 @@ class _Payload:
 
 
 def _calls(path):
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in syntax.nodes(path):
         if isinstance(node, ast.Call):
             yield (
                 ast.unparse(node.func),
@@ -45,7 +47,7 @@ def _calls(path):
             )
 
 
-@pytest.mark.parametrize("path", _MODULES, ids=lambda path: path.relative_to(ROOT).as_posix())
+@holds_of_all(_MODULES)
 def test_no_module_executes_or_unpickles_what_it_reads(path):
     name = path.relative_to(ROOT).as_posix()
     for function, options in _calls(path):

@@ -7,9 +7,8 @@ import ast
 import re
 from pathlib import Path
 
-import pytest
-
 from tests.laws import syntax
+from tests.laws.conventions import holds_of_all
 
 _ROOT = Path(__file__).parents[1]
 _PAGES = [
@@ -123,12 +122,12 @@ def _found(text):
     return _PATTERN.findall(re.sub(r"```.*?```|`[^`]*`", "", text, flags=re.DOTALL))
 
 
-@pytest.mark.parametrize("path", _MODULES, ids=lambda path: path.relative_to(_ROOT).as_posix())
+@holds_of_all(_MODULES)
 def test_docstrings_use_the_fields_words(path):
     assert [word for text in _docstrings(path) for word in _found(text)] == []
 
 
-@pytest.mark.parametrize("path", _MODULES, ids=lambda path: path.relative_to(_ROOT).as_posix())
+@holds_of_all(_MODULES)
 def test_messages_use_the_fields_words(path):
     assert [word for text in _messages(path) for word in _found(text)] == []
 
@@ -145,7 +144,7 @@ def test_public_names_are_the_fields():
     assert found == set()
 
 
-@pytest.mark.parametrize("path", _PAGES, ids=lambda path: path.relative_to(_ROOT).as_posix())
+@holds_of_all(_PAGES)
 def test_documents_use_the_fields_words(path):
     assert _found(path.read_text()) == []
 
