@@ -36,6 +36,11 @@ def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: item.get_closest_marker("longest") is None)
 
 
+def pytest_sessionfinish():
+    # pytest and JAX look for garbage as a process ends, through all that it has compiled: seconds.
+    gc.freeze()
+
+
 def pytest_configure(config):
     # Of commands, and XLA's flags, which are read with the first array. `_compiled_lightly` is for
     # the suite's own processes.

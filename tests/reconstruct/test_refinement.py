@@ -14,8 +14,6 @@ from refref_jax.reconstruct.smoothing import denoise_within
 from tests.factories import bodies
 from tests.factories.scenes import volume_of
 
-pytestmark = pytest.mark.computing
-
 _BOX = Box(np.full(3, -1.6), np.full(3, 1.6))
 
 _NOTHING = Refinement(denoising=0.0, convex_depth=0.0)

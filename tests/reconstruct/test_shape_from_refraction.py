@@ -36,7 +36,7 @@ from refref_jax.render import backdrop
 from refref_jax.sampling.scene_bounds import Domain
 from tests.factories import bodies
 
-pytestmark = [pytest.mark.longest, pytest.mark.computing]
+pytestmark = pytest.mark.longest
 
 _SIDE = 64
 _INDEX = 1.5
