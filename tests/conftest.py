@@ -37,7 +37,7 @@ def pytest_collection_modifyitems(items):
 
 
 def pytest_sessionfinish():
-    # pytest and JAX look for garbage as a process ends, through all that it has compiled: seconds.
+    # pytest and Python collect garbage as a process ends, among all that it has traced: seconds.
     gc.freeze()
 
 

@@ -20,7 +20,8 @@ _MOST_LINES_OF_THE_COMMAND_LINE = 900
 @holds_of_all(_FILES)
 def test_every_file_is_a_command(path):
     last = syntax.nodes(path)[0].body[-1]
-    assert isinstance(last, ast.If) and ast.unparse(last.test) == "__name__ == '__main__'"
+    assert isinstance(last, ast.If), "it does not end with `if`"
+    assert ast.unparse(last.test) == "__name__ == '__main__'"
     assert ast.unparse(last.body[0]).startswith("app.run(main")
 
 

@@ -12,7 +12,7 @@ def nodes(path):
 
 @functools.cache
 def imports(path):
-    """Returns the dotted names that a module imports."""
+    """Returns the dotted names that a module imports, with the names taken from them."""
     found = []
     for node in nodes(path):
         if isinstance(node, ast.Import):
