@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from absl import app, flags
+from absl import app, flags, logging
 from jaxtyping import Float
 
 from experiments.cameras import bundle, refined_scene, through_object
@@ -131,6 +131,7 @@ def _measure(source: Path, degrees: float, percent: float) -> list[Measured]:
 
 def main(arguments: list[str]) -> None:
     del arguments
+    logging.set_verbosity(logging.ERROR)  # Orbax tells of every checkpoint
     rows: list[Measured] = []
     Path(_OUT.value).mkdir(parents=True, exist_ok=True)
     for source in map(Path, _SCENES.value):

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from absl import app, flags
+from absl import app, flags, logging
 from jaxtyping import Float
 
 from experiments.r3f import index_stage
@@ -44,6 +44,7 @@ _DEPTH = 0.8
 
 def main(arguments: list[str]) -> None:
     del arguments
+    logging.set_verbosity(logging.ERROR)  # Orbax tells of every checkpoint
     scene, out = Path(_SCENE.value), Path(_OUT.value)
     out.mkdir(parents=True, exist_ok=True)
     surface = index_stage.learn_backdrop(scene, out, seed=0)

@@ -11,7 +11,7 @@ are reused.
 import time
 from pathlib import Path
 
-from absl import app, flags
+from absl import app, flags, logging
 
 from experiments.r3f import chain, index_stage, object_source
 from experiments.r3f.records import ReconstructionConfig
@@ -31,6 +31,7 @@ _CELLS = 128
 
 def main(arguments: list[str]) -> None:
     del arguments
+    logging.set_verbosity(logging.ERROR)  # Orbax tells of every checkpoint
     starts = [float(start) for start in _STARTS.value]
     rows, wrong = [], []
     for scene in map(Path, _SCENES.value):

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
-from absl import app, flags
+from absl import app, flags, logging
 from scipy.ndimage import binary_dilation
 
 from experiments.r3f import index_stage, light_stage, object_source, records
@@ -46,6 +46,7 @@ _NORMALS, _INDEX = 0.25, 0.003
 
 def main(arguments: list[str]) -> None:
     del arguments
+    logging.set_verbosity(logging.ERROR)  # Orbax tells of every checkpoint
     print(
         "| inputs | surface | index | normals, degrees: mean, 99 % |\n|---|---|---|---|", flush=True
     )
