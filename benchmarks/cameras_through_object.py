@@ -131,7 +131,7 @@ def _measure(source: Path, degrees: float, percent: float) -> list[Measured]:
 
 def main(arguments: list[str]) -> None:
     del arguments
-    logging.set_verbosity(logging.ERROR)  # Orbax tells of every checkpoint
+    logging.set_verbosity(logging.ERROR)  # Orbax logs every checkpoint
     rows: list[Measured] = []
     Path(_OUT.value).mkdir(parents=True, exist_ok=True)
     for source in map(Path, _SCENES.value):

@@ -44,7 +44,7 @@ _DEPTH = 0.8
 
 def main(arguments: list[str]) -> None:
     del arguments
-    logging.set_verbosity(logging.ERROR)  # Orbax tells of every checkpoint
+    logging.set_verbosity(logging.ERROR)  # Orbax logs every checkpoint
     scene, out = Path(_SCENE.value), Path(_OUT.value)
     out.mkdir(parents=True, exist_ok=True)
     surface = index_stage.learn_backdrop(scene, out, seed=0)

@@ -31,7 +31,7 @@ _CELLS = 128
 
 def main(arguments: list[str]) -> None:
     del arguments
-    logging.set_verbosity(logging.ERROR)  # Orbax tells of every checkpoint
+    logging.set_verbosity(logging.ERROR)  # Orbax logs every checkpoint
     starts = [float(start) for start in _STARTS.value]
     rows, wrong = [], []
     for scene in map(Path, _SCENES.value):

@@ -46,7 +46,7 @@ _NORMALS, _INDEX = 0.25, 0.003
 
 def main(arguments: list[str]) -> None:
     del arguments
-    logging.set_verbosity(logging.ERROR)  # Orbax tells of every checkpoint
+    logging.set_verbosity(logging.ERROR)  # Orbax logs every checkpoint
     print(
         "| inputs | surface | index | normals, degrees: mean, 99 % |\n|---|---|---|---|", flush=True
     )
