@@ -23,6 +23,9 @@ os.environ.update(code_generator.faster())
 import jax
 import pytest
 
+# Imports JAX, which reads the environment.
+from tests.processes import mlir_contexts
+
 bytecode.reuse_that_of_other_packages()
 
 # Traced programs are millions of objects: to look for garbage among them took a tenth of the time.
@@ -46,6 +49,7 @@ def pytest_configure(config):
     # the suite's own processes.
     if _is_quick(config):
         os.environ.update(code_generator.lighter())
+        mlir_contexts.reuse()
 
 
 def _is_quick(config):

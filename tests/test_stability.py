@@ -10,11 +10,13 @@ pytestmark = pytest.mark.longest
 
 
 # Whole paths whose single interfaces are quick, double precision, what
-# `tests/geometry/test_hit_robustness.py` has of single hits, and scales beside powers of two.
+# `tests/geometry/test_hit_robustness.py` has of single hits, scales beside powers of two, and
+# starts on surfaces, of which `tests/optics/test_path_tree.py` has a few.
 _SLOW = (
     "ball",
     "index-matched bodies",
     "there and back",
+    "starting on surfaces",
     "ball, float64",
     "slabs of all ratios and angles, float64",
     "offsets 1 to 1e4",

@@ -13,6 +13,8 @@ from refref_jax.data import meshes
 from refref_jax.data.mesh_queries import find_containment
 from refref_jax.data.meshes import MeshPart
 from refref_jax.data.scene_assembly import assemble_scene
+from refref_jax.geometry import bvh_build
+from refref_jax.geometry.surfaces import Surfaces
 from refref_jax.geometry.triangle_meshes import volume
 
 
@@ -32,6 +34,18 @@ def build(*parts, rule="nested"):
     tree = find_containment(parts)
     built = assemble_scene(parts, tree.parents, rule=rule, overlaps=tree.overlaps)
     return jax.device_put(built)
+
+
+def with_spare_rows(scene):
+    """Fills the tables of meshes up to powers of two, so that scenes can share a program.
+
+    Nothing is ever found in the rows that are added.
+    """
+    bvh, *by_triangle = scene.surfaces
+    spare = bvh_build.spare_rows(len(bvh.triangles))
+    filled = [np.concatenate([x, np.repeat(x[-1:], spare, axis=0)]) for x in by_triangle]
+    surfaces = Surfaces(bvh_build.filled_up(bvh), *filled)
+    return jax.device_put(scene._replace(surfaces=surfaces))
 
 
 @functools.cache

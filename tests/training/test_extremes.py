@@ -60,11 +60,9 @@ _CASES = {
 
 _begin = jax.jit(optimizer(_SCHEDULE, small_model.MODEL).init)
 
-_each_precision = pytest.mark.parametrize(
-    "precision", [pytest.param("float32", marks=pytest.mark.slow), "bfloat16"]
-)
+_each_precision = pytest.mark.parametrize("precision", ["float32", "bfloat16"])
 
-# A step takes seconds to compile: every run of the suite does the richest, and one in bfloat16.
+# A step takes seconds to compile: every run of the suite does the richest.
 _OFTEN = [("absorbing", "float32")]
 _each_case = pytest.mark.parametrize(
     ("name", "precision"),
@@ -191,6 +189,7 @@ def test_colours_above_white_are_drawn_back_unless_a_pixel_is_saturated(
     assert np.all(extremes.colour_bias(moved) <= 9.0)
 
 
+@pytest.mark.slow
 @_each_precision
 @pytest.mark.parametrize(("raw", "target"), [(8.0, 0), (-8.0, 255)])
 def test_a_wrong_colour_beyond_what_an_image_holds_can_still_turn(raw, target, precision):

@@ -4,9 +4,10 @@ import json
 
 import pytest
 
-from experiments.r3f import chain, records, report
+from experiments.r3f import chain, records
 from experiments.r3f.records import ReconstructionConfig
 from tests.factories.silhouettes import write_scene
+from tests.fakes import report_pictures
 from tests.processes.command import run_command, run_module
 
 pytestmark = pytest.mark.longest
@@ -30,8 +31,7 @@ def made(scene, tmp_path_factory):
     """A reconstruction of it."""
     out = tmp_path_factory.mktemp("made") / "r3f"
     config = ReconstructionConfig("hull", 20, 0, 1.45, None, None, "none", 0)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(report, "_HEIGHT", 40)  # as in `print_beginnings`
+    with report_pictures.left_empty():  # as in `print_beginnings`
         chain.reconstruct(scene, out, config, compare=False, say=lambda text: None)
     return out
 
