@@ -29,6 +29,8 @@ def rendered(tmp_path_factory):
     return out, result.stdout
 
 
+# At each run, `test_against_cycles` compares the same images.
+@pytest.mark.slow
 def test_a_rendering_is_measured_and_pictured(rendered):
     out, printed = rendered
     summary = json.loads((out / "metrics.json").read_text())
