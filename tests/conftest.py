@@ -5,7 +5,7 @@ import shutil
 import tempfile
 from pathlib import Path
 
-from tests.processes import bytecode, code_generator
+from tests.processes import bytecode, checked, code_generator
 
 # Several processes share an accelerator.
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
@@ -27,6 +27,7 @@ import pytest
 from tests.processes import mlir_contexts
 
 bytecode.reuse_that_of_other_packages()
+checked.from_the_first_call()
 
 # Traced programs are millions of objects: to look for garbage among them took a tenth of the time.
 gc.set_threshold(100_000, 10, 10)
