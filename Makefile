@@ -23,7 +23,7 @@ SMALL_SCENES := cube_smcvx_cylinder,env_smcvx_pyramid,cube_smncvx_torus,sphere_s
 SMALL_SCENES := $(SMALL_SCENES),sphere_mmncvx_conical_flask,env_mmncvx_perfume_red
 SMALL_SCENES := $(SMALL_SCENES),cube_mmncvx_flower_vase,sphere_smncvx_light_bulb
 
-# As many processes as cores, at most 5: each one imports all tests, which takes half a minute.
+# As many processes as cores, at most 5: each one imports all tests, which takes 20 s.
 PROCESSES = $(shell $(PYTHON) -c 'import os; print(min(5, os.cpu_count() or 1))')
 PYTEST = $(RUN) pytest --numprocesses=$(PROCESSES) --dist=loadscope --no-loadscope-reorder
 DATASET_TESTS := tests/experiments/dataset

@@ -8,7 +8,8 @@ import pytest
 from beartype import beartype
 from jaxtyping import Array, Float, TypeCheckError
 
-from refref_jax.optics import fresnel
+from refref_jax.optics import fresnel, path_settings
+from tests.processes import checked
 
 _checked = jaxtyping.jaxtyped(typechecker=beartype)
 
@@ -47,6 +48,15 @@ class _Cloud:
 def test_a_function_of_the_library_is_checked():
     with pytest.raises(TypeCheckError, match=r"(?s)reflect.*normal"):
         fresnel.reflect(jnp.ones(3), jnp.ones(2))
+
+
+def test_a_function_is_decorated_when_it_is_called():
+    assert fresnel.reflect.__code__.co_filename == checked.__file__
+
+
+def test_a_field_of_a_dataclass_is_checked():
+    with pytest.raises(TypeCheckError, match="most"):
+        path_settings.Detail("all", "3")
 
 
 def test_sizes_are_the_same_in_all_arguments():
