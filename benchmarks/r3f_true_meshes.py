@@ -29,7 +29,7 @@ _FOUND = flags.DEFINE_list(
 )
 
 _SHARE = 0.1
-"""Largest share of the error, of what true meshes explain, that true media explain."""
+"""Largest error that true media explain, as a share of what true meshes explain."""
 
 
 def error_of(parts: Sequence[MeshPart], surface: Backdrop, judges: Photographs) -> float:
@@ -59,6 +59,8 @@ def measure(scene: Path, reconstruction: Path) -> tuple[float, float, float]:
         exposure=config.exposure,
         seed=config.seed,
     )
+    if surface is None:
+        raise ValueError(f"{reconstruction} has no backdrop, in front of which errors are measured.")
     true = meshes.read_meshes(scene)
     indices = {part.index for part in true if part.index != INDEX_OF_AIR}
     if len(indices) != 1:

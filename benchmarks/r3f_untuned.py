@@ -49,11 +49,11 @@ class Row(NamedTuple):
 
 def main(arguments: list[str]) -> None:
     del arguments
-    print("| scene | error | **found by light** | straight rays | gain |")
-    print("|---|---|---|---|---|", flush=True)
     scenes = [Path(scene) for scene in _SCENES.value]
     for scene in scenes:
         measured_runs.check_masks(scene)
+    print("| scene | error | **found by light** | straight rays | gain |")
+    print("|---|---|---|---|---|", flush=True)
     gains = []
     for scene in scenes:
         row = measure(scene)
