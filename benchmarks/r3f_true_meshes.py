@@ -60,7 +60,7 @@ def measure(scene: Path, reconstruction: Path) -> tuple[float, float, float]:
         seed=config.seed,
     )
     if surface is None:
-        raise ValueError(f"{reconstruction} has no backdrop, in front of which errors are measured.")
+        raise ValueError(f"{reconstruction} has no backdrop to measure errors in front of.")
     true = meshes.read_meshes(scene)
     indices = {part.index for part in true if part.index != INDEX_OF_AIR}
     if len(indices) != 1:
