@@ -9,8 +9,8 @@ error of the validation pixels (root mean square of the channels of a pixel, at 
 mean over the pixels), the masked PSNR of test views, and the gain. Finished reconstructions and
 trainings are reused.
 
-Asserted is the mean gain over all scenes that are given. docs/shape_from_light.md lists scenes that
-led to no change of the code, and the command that renders them.
+Asserted is the mean gain over all scenes that are given. docs/shape_from_light_results.md lists
+scenes that led to no change of the code, and the command that renders them.
 """
 
 import statistics
