@@ -4,7 +4,8 @@
 
 Each scene is reconstructed from its images and masks as `experiments.reconstruct` does. One model
 is trained with the reconstruction in front of a backdrop, with a field inside if the shape leaves
-an error, and another one along straight rays; fields have the preset `tiny`. The table has the
+an error, and another one along straight rays; fields, also those of opaque parts, have the preset
+`tiny` and as many steps. The table has the
 error of the validation pixels (root mean square of the channels of a pixel, at most 0.15, sRGB; its
 mean over the pixels), the masked PSNR of test views, and the gain. Finished reconstructions and
 trainings are reused.
@@ -87,7 +88,9 @@ def measure(scene: Path) -> Row:
     field = ["--preset=tiny", f"--steps={_STEPS.value}"]
     found = [f"--reconstruction={made}", "--paths=tree", "--far_field=backdrop"]
     if light.leaves_error:
-        found += ["--interior=field", *field]
+        found.append("--interior=field")
+    if light.leaves_error or any(part.radiance is not None for part in light.parts):
+        found += field
     return Row(
         error=light.after,
         found=_masked(folder / "found", scene, found),
