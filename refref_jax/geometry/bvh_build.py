@@ -25,8 +25,8 @@ _BACKWARDS = ((np.arange(OCTANTS)[:, None] >> np.arange(3)) & 1).astype(bool)
 # Relative difference of costs that count as equal: rounding must not choose between them.
 _TIE = 1e-9
 
-# Fewest rows of tables that are filled up.
-_FEWEST_ROWS = 4096
+# Rows of tables of small meshes that are filled up, and fewest rows of those of larger ones.
+_FEW_ROWS, _MANY_ROWS = 4096, 1 << 17
 
 
 class _Grid(NamedTuple):
@@ -360,10 +360,10 @@ def build(
 
 
 def filled_up(bvh: BVH) -> BVH:
-    """Returns the same tree with rows that are never read, up to powers of two.
+    """Returns the same tree with rows that are never read, up to a few sizes (`spare_rows`).
 
-    Trees of similar meshes differ in size. With powers of two, a program that was compiled for one
-    of them serves the others; compiling takes longer than a step of a fit.
+    Trees of similar meshes differ in size. With few sizes, a program that was compiled for one of
+    them serves the others; compiling takes longer than several steps of a fit.
     """
     tables, rows = _filled(np.asarray(bvh.nodes), axis=1), bvh.nodes.shape[1]
     octants = np.arange(OCTANTS, dtype=np.int32)[:, None]
@@ -383,8 +383,13 @@ def _filled(rows: np.ndarray, axis: int = 0) -> np.ndarray:
 
 
 def spare_rows(count: int) -> int:
-    """Returns how many rows `filled_up` adds to this many, up to a power of two."""
-    return max(_FEWEST_ROWS, 1 << (count - 1).bit_length()) - count
+    """Returns how many rows `filled_up` adds to this many: up to 4096, 131,072 or a power of two.
+
+    The families and vessels that are fitted to an object have some ten thousand faces, as its mesh
+    from masks has: one program serves them all.
+    """
+    few = count <= _FEW_ROWS
+    return (_FEW_ROWS if few else max(_MANY_ROWS, 1 << (count - 1).bit_length())) - count
 
 
 def _empty(dtype: np.dtype) -> BVH:

@@ -38,9 +38,8 @@ _LEAST, _GAP = 0.003, 0.001
 # of the radius.
 _DEVIATIONS, _STEPS = (1.0, 1.0, 1.0, 0.7), 0.25
 
-# Mesh of a bubble, and number of interfaces of an object of few bubbles: those without faces let
-# all share one compiled program.
-_SUBDIVISIONS, _PARTS = 4, 9
+# Subdivisions of the icosahedron that is the mesh of a bubble.
+_SUBDIVISIONS = 4
 
 
 class Bubble(NamedTuple):
@@ -135,7 +134,7 @@ class ObjectWithBubbles:
             by_normals=_widened(outer.by_normals, len(x)),
         )
         held = [self._posed(each) for each in self._limited_bubbles(x, outer)]
-        count = max(_PARTS, 1 + len(held))
+        count = 1 + len(held)
         tint = np.asarray(at_rest.interfaces.tint, np.float64)[0].tolist()
         interfaces = nested(
             [self.solid.index_of(x[: self.own])] + [self.index] * (count - 1),

@@ -15,9 +15,6 @@ from refref_jax.optics.media import INDEX_OF_AIR, Interfaces
 GLASS_DEVIATION = 0.03
 """Standard deviation of the index of glass, which is nearly known."""
 
-# Number of interfaces of every vessel: those without faces let all share one compiled program.
-_PARTS = 3
-
 Contents = Literal["none", "air", "liquid", "liquid and air"]
 """What is inside the glass; `none` is solid glass."""
 
@@ -186,15 +183,14 @@ class Medium:
 
 
 def media_of(now: Interior, at: Layout) -> list[Medium]:
-    """Returns the medium of each part of a vessel, and of those without faces."""
+    """Returns the medium of each part of a vessel."""
     fixed, clear = slice(0), NO_ABSORPTION
     media = {
         "glass": Medium(now.glass, now.glass_tint, clear, at.glass, at.glass_tint, fixed),
         "liquid": Medium(now.liquid, now.tint, now.absorption, at.liquid, at.tint, at.absorption),
         "air": Medium(INDEX_OF_AIR, CLEAR, clear, fixed, fixed, fixed),
     }
-    materials = now.materials
-    return [media[name] for name in materials + ["air"] * (_PARTS - len(materials))]
+    return [media[name] for name in now.materials]
 
 
 def interfaces_of(media: Sequence[Medium]) -> Interfaces:

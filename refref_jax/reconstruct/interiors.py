@@ -411,7 +411,7 @@ class Vessel:
         found: list[Solid] = []
         media = media_of(self.interior(x), self.layout)
         parts = zip(self.interior_at_start.materials, self._unfolded(x), strict=True)
-        for medium, (name, part) in zip(media, parts, strict=False):
+        for medium, (name, part) in zip(media, parts, strict=True):
             parent = 0 if found else NO_PARENT
             found.append(
                 Solid(name, mesh_of(part), medium.index, parent, medium.tint, medium.absorption)

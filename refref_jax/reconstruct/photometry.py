@@ -18,6 +18,7 @@ Source: ours. Igehy, Tracing Ray Differentials (1999), for the footprints.
 """
 
 import functools
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
@@ -46,9 +47,10 @@ from refref_jax.sampling.scene_bounds import Domain
 MAIN = PathSettings(max_bends=8, reflections="all", min_throughput=TREE.min_throughput)
 """The main path: 8 bends are enough for 99 % of the pixels of a torus or of a filled flask."""
 
-# Number of rays traced at once (the same for any number of rays: one compilation), and largest
-# number of taps along each axis of a footprint.
-_TILE = 8192
+# Number of rays traced at once on a CPU (the same for any number of rays: one compilation, and few
+# enough that two cores share the judges of a step), and largest number of taps along each axis of a
+# footprint.
+_TILE = 4096
 _TAPS = 3
 
 # Half the width of the difference that gives the slope of the radiance, in cells of the resolution
@@ -57,6 +59,9 @@ _HALF_WIDTH = 0.5
 
 # Light beside the main path that is below this share has no colour of its own.
 _LITTLE = 0.01
+
+# Numbers of interfaces on the device: those without faces let scenes of few parts share a program.
+_FEW_PARTS, _MORE_PARTS = 4, 16
 
 _Tree = TypeVar("_Tree")
 
@@ -107,18 +112,20 @@ class TracedObject(NamedTuple):
     """A scene on the device, and the faces that its primitives are.
 
     Attributes:
-      scene: the scene; its parts are nested dielectrics.
+      scene: the scene; its parts are nested dielectrics, of which some have no faces.
       faces: face of each primitive, counted over all parts.
       division: division of the faces among the nodes of the tree.
+      parts: number of the parts.
     """
 
     scene: Scene
     faces: Int[np.ndarray, " primitives"]
     division: Division
+    parts: int
 
     def with_interfaces(self, interfaces: Interfaces) -> "TracedObject":
         """Returns the same surfaces between other media."""
-        scene = self.scene._replace(interfaces=jax.device_put(interfaces))
+        scene = self.scene._replace(interfaces=jax.device_put(_filled_up(interfaces)))
         return self._replace(scene=scene)
 
 
@@ -203,7 +210,23 @@ def assemble(
         numerics.host_array(parts[order].astype(np.int32)),
         numerics.host_array(np.zeros((0, 3, 3), np.float32)),
     )
-    return TracedObject(jax.device_put(Scene(packed, interfaces)), order, division)
+    scene = jax.device_put(Scene(packed, _filled_up(interfaces)))
+    return TracedObject(scene, order, division, len(interfaces.index_inside))
+
+
+def _filled_up(interfaces: Interfaces) -> Interfaces:
+    """Returns interfaces with some that no face has, which repeat the last one."""
+    count = len(interfaces.index_inside)
+    some = _FEW_PARTS if count <= _FEW_PARTS else math.ceil(count / _MORE_PARTS) * _MORE_PARTS
+
+    def with_more(name: str, axis: int) -> Any:
+        known = np.asarray(getattr(interfaces, name))
+        last = np.repeat(np.take(known, [-1], axis=axis), some - count, axis=axis)
+        return numerics.host_array(np.concatenate([known, last], axis=axis))
+
+    by_part = "index_inside", "index_outside", "medium_outside", "tint", "absorption"
+    filled = {name: with_more(name, 0) for name in by_part}
+    return interfaces._replace(**filled, index_by_channel=with_more("index_by_channel", 2))
 
 
 def blurred(surface: Backdrop, halvings: int) -> Backdrop:
@@ -284,7 +307,13 @@ def sensitivities(
     others = (predicted.linear - light) / np.maximum(1.0 - share, _LITTLE)
     by_share = np.where(1.0 - share > _LITTLE, radiance - others, 0.0)
     slopes = np.concatenate([found.slopes, by_share[:, None]], axis=1)
-    return found._replace(slopes=slopes, light=light)
+    return found._replace(
+        slopes=slopes,
+        light=light,
+        by_indices=found.by_indices[..., : traced.parts],
+        crossings=found.crossings[:, : traced.parts],
+        lengths=found.lengths[:, : traced.parts],
+    )
 
 
 def residuals(
@@ -305,14 +334,14 @@ def _encode(linear: Float[ArrayLike, "*rays 3"]) -> Float[Array, "*rays 3"]:
 
 def _in_tiles(render: Callable[[Rays], _Tree], rays: Rays) -> _Tree:
     """Returns the results for all rays, as NumPy arrays."""
-    count = rays.radii.shape[0]
+    count, tile = rays.radii.shape[0], images.on_this_device(_TILE)
 
     def see(start: int) -> _Tree:
-        part, _ = images.crop(rays, None, start, _TILE)
-        kept = min(_TILE, count - start)
+        part, _ = images.crop(rays, None, start, tile)
+        kept = min(tile, count - start)
         return jax.tree.map(lambda x: np.asarray(x)[:kept], render(part))
 
-    return images.join(at_once(see, range(0, count, _TILE)))
+    return images.join(at_once(see, range(0, count, tile)))
 
 
 @traced_once

@@ -37,7 +37,7 @@ def build(*parts, rule="nested"):
 
 
 def with_spare_rows(scene):
-    """Fills the tables of meshes up to powers of two, so that scenes can share a program.
+    """Fills the tables of meshes up to few sizes, so that scenes can share a program.
 
     Nothing is ever found in the rows that are added.
     """

@@ -186,8 +186,10 @@ def test_the_spare_rows_of_a_tree_lead_to_its_end(faces):
     assert np.all(nodes[..., 6][~spare] <= last[~spare])
 
 
-@pytest.mark.parametrize("rows, spare", [(1, 4095), (4096, 0), (4097, 4095), (19_456, 13_312)])
-def test_tables_are_filled_up_to_powers_of_two(rows, spare):
+@pytest.mark.parametrize(
+    "rows, spare", [(1, 4095), (4096, 0), (4097, 126_975), (131_072, 0), (131_073, 131_071)]
+)
+def test_tables_are_filled_up_to_few_sizes(rows, spare):
     assert bvh_build.spare_rows(rows) == spare
 
 
