@@ -421,8 +421,8 @@ BUGS = (
     Bug(
         "derivatives by normals left out",
         "reconstruct/gauss_newton.py",
-        "total = total + turned @ _stacked(",
-        "total = total + 0.0 * turned @ _stacked(",
+        "turned @ by_normals",
+        "0.0 * turned @ by_normals",
         _TEST_REFRACTION,
     ),
     Bug(

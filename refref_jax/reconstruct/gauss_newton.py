@@ -31,9 +31,10 @@ from typing import Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
 import numpy as np
 import scipy.linalg
 import scipy.sparse
-from jaxtyping import Float, Int, Num
+from jaxtyping import Bool, Float, Int, Num
 
 from refref_jax.choices import SATURATED
+from refref_jax.compilation import at_once
 from refref_jax.geometry.bvh import NO_PRIMITIVE
 from refref_jax.optics.media import Interfaces
 from refref_jax.reconstruct import ReconstructionError, photometry
@@ -55,8 +56,9 @@ _LEAST_SCALE, _SCALE, _NARROWING, _LEAST_NOISE = 0.02, 1.5, 0.9, 0.005
 _DARK, _FULL = 2e-3, 0.1
 
 # Pixels where less of the light was followed, or that end where fewer pixels saw the backdrop
-# directly, do not count. Number of unknowns above which a sample estimates their covariance's size.
-_FOLLOWED, _SEEN, _MANY = 0.7, 0.5, 1000
+# directly, do not count. Unknowns above which a sample estimates their covariance's size. First
+# steps, which do not show if a fit will succeed. Ratio of errors below which a step may be doubled.
+_FOLLOWED, _SEEN, _MANY, _FIRST, _WORTH = 0.7, 0.5, 1000, 3, 0.995
 
 
 class Candidate(NamedTuple):
@@ -126,6 +128,8 @@ class Steps:
       widest: least scale of the robust weights in the first step, sRGB; it falls by a tenth in
         each. Without it, a fault that few pixels see has no weight.
       gain: least relative gain; the fit ends after two steps in a row, without blur, of less.
+      limits: error of the judges of each step, sRGB, above which the fit is given up; the first
+        three steps have none.
     """
 
     blurs: tuple[int, ...] = (2, 1, 0, 0, 0, 0)
@@ -136,6 +140,7 @@ class Steps:
     seed: int = 0
     widest: float = 0.0
     gain: float = 0.0
+    limits: tuple[float, ...] = ()
 
 
 class StepFacts(NamedTuple):
@@ -267,8 +272,10 @@ def fit(
 
 
 def _has_ended(facts: Sequence[StepFacts], settings: Steps) -> bool:
-    """Returns whether further steps would change little."""
-    last = facts[-1]
+    """Returns whether further steps would change little, or the fit has failed."""
+    last, limited = facts[-1], _FIRST < len(facts) <= len(settings.limits)
+    if limited and min(last.before, last.after) > settings.limits[len(facts) - 1]:
+        return True
     if last.blur == 0 and last.taken and last.change < settings.least:
         return True
     slow = [each.blur == 0 and each.after > (1.0 - settings.gain) * each.before for each in facts]
@@ -313,7 +320,7 @@ def _step(
         change *= min(1.0, 1.0 / max(float(np.max(np.abs(change) / scales)), 1e-12))
         error, there = after(change)
         # Far from the solution, slopes promise too little: steps are doubled as long as that helps.
-        while error < before and float(np.max(np.abs(change) / scales)) < 0.5:
+        while error < _WORTH * before and float(np.max(np.abs(change) / scales)) < 0.5:
             further = after(2.0 * change)
             if further[0] >= error:
                 break
@@ -366,7 +373,7 @@ def linearise(
     coordinates = _by_unknowns(candidate, traced, found)
     usable = found.usable & (predicted.dropped < 1.0 - _FOLLOWED) & (found.coverage > _SEEN)
     weights = _robust_weights(error, usable, max(least_scale, _LEAST_SCALE))
-    weights = weights * _unsaturated(predicted.linear, pixels.rgb)
+    weights = weights * ((pixels.rgb < SATURATED) | (predicted.linear < 1.0))
     jacobian = _block_diagonal(np.swapaxes(slopes, 1, 2)) @ coordinates
     light = found.light * encode
     if candidate.by_tints.shape[0]:
@@ -417,33 +424,34 @@ def _by_unknowns(
     first_normal = np.cumsum([0] + [len(part.normals) for part in parts]).tolist()
     vertices = np.concatenate([p.faces + n for p, n in zip(parts, first, strict=False)])
     normals = np.concatenate([p.normal_ids + n for p, n in zip(parts, first_normal, strict=False)])
-    ray, bend = np.nonzero(found.primitives != NO_PRIMITIVE)
-    face = traced.faces[found.primitives[ray, bend]]
-    count = len(found.primitives)
-    total = _scattered(found.by_corners[ray, :, bend], ray, vertices[face], (count, first[-1]))
-    by = _stacked([part.by_vertices for part in parts])
-    total = total @ by
-    turned = _scattered(
-        found.by_normals[ray, :, bend], ray, normals[face], (count, first_normal[-1])
-    )
-    total = total + turned @ _stacked([part.by_normals for part in parts])
-    by_index = scipy.sparse.csr_array(found.by_indices.reshape(3 * count, -1).astype(np.float64))
-    return total + by_index @ candidate.by_indices
+    derivatives = [p.by_vertices for p in parts], [p.by_normals for p in parts]
+    by_vertices, by_normals = at_once(_stacked, derivatives)
+    met = found.primitives != NO_PRIMITIVE
+    face = traced.faces[np.where(met, found.primitives, 0)]
+
+    def of_rays(some: Int[np.ndarray, " some"]) -> Matrix:
+        at, hit = face[some], met[some]
+        moved = _scattered(found.by_corners[some], hit, vertices[at], first[-1])
+        turned = _scattered(found.by_normals[some], hit, normals[at], first_normal[-1])
+        by_index = found.by_indices[some].reshape(3 * len(some), -1).astype(np.float64)
+        bent = scipy.sparse.csr_array(by_index) @ candidate.by_indices
+        return moved @ by_vertices + turned @ by_normals + bent
+
+    return _stacked(at_once(of_rays, np.array_split(np.arange(len(met)), 2)))
 
 
 def _scattered(
-    blocks: Float[np.ndarray, "bends 3 3 3"],
-    ray: Int[np.ndarray, " bends"],
-    columns: Int[np.ndarray, "bends 3"],
-    shape: tuple[int, int],
+    blocks: Float[np.ndarray, "rays 3 bends 3 3"],
+    met: Bool[np.ndarray, "rays bends"],
+    columns: Int[np.ndarray, "rays bends 3"],
+    count: int,
 ) -> scipy.sparse.csr_array:
-    """Returns a sparse matrix `[3 rays, 3 columns]` of blocks of coordinate, corner and axis."""
-    axes = np.arange(3, dtype=np.int32)
-    rows = 3 * ray[:, None, None, None].astype(np.int32) + axes[:, None, None]
-    places = 3 * columns[:, None, :, None].astype(np.int32) + axes
-    rows, places = np.broadcast_arrays(rows, places)
-    entries = (blocks.astype(np.float64).reshape(-1), (rows.reshape(-1), places.reshape(-1)))
-    return scipy.sparse.coo_array(entries, shape=(3 * shape[0], 3 * shape[1])).tocsr()
+    """Returns a sparse matrix `[3 rays, 3 count]` of blocks of coordinate, corner and axis."""
+    kept = np.broadcast_to(met[:, None], blocks.shape[:3])
+    places = np.broadcast_to(3 * columns[:, None, ..., None] + np.arange(3), blocks.shape)
+    starts = np.append(0, np.cumsum(np.repeat(9 * met.sum(axis=1), 3)))
+    entries = blocks[kept].astype(np.float64).reshape(-1), places[kept].reshape(-1), starts
+    return scipy.sparse.csr_array(entries, shape=(len(starts) - 1, 3 * count))
 
 
 def _stacked(matrices: Sequence[Matrix]) -> Matrix:
@@ -477,12 +485,6 @@ def _robust_weights(
     scale = max(least, _SCALE * float(np.median(size[usable]))) if usable.any() else 1.0
     weight = usable / (1.0 + (size / scale) ** 2) ** 2
     return np.repeat(weight[:, None], 3, axis=1)
-
-
-def _unsaturated(
-    linear: Float[np.ndarray, "rays 3"], rgb: Float[np.ndarray, "rays 3"]
-) -> np.ndarray:
-    return (rgb < SATURATED) | (linear < 1.0)
 
 
 def _without_largest(

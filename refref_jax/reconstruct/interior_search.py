@@ -200,15 +200,19 @@ def search(
     again = again or [each.vessel.interior_at_start for each in rivals]
     fitted = functools.partial(_fitted, surface, pixels, judges, outlines)
 
-    def fit_all(vessel: Vessel) -> Finding:
-        return fitted(settings, vessel, vessel.start(), settings.all)
+    def fit_all(vessel: Vessel, limits: tuple[float, ...] = ()) -> Finding:
+        return fitted(settings, vessel, vessel.start(), settings.all, limits=limits)
 
     report = _reporter(say, _AGAIN, _ALL, len(again) + len(settings.level_shifts))
     vessels = [Vessel(outer, interior, detail._replace(fine=False)) for interior in again]
     vessels.sort(key=lambda each: each.layout.count)
     findings = _fit_each(fit_all, vessels, "all unknowns", report)
-    others = _with_other_levels(min(findings, key=_error), settings)
-    for moved in _fit_each(fit_all, others, "another level", report):
+    leading = min(findings, key=_error)
+    steps = leading.trial.fit.steps
+    limits = tuple(settings.close * min(step.before, step.after) for step in steps)
+    behind = functools.partial(fit_all, limits=limits)
+    others = _with_other_levels(leading, settings)
+    for moved in _fit_each(behind, others, "another level", report):
         findings = [_better(moved, each) for each in findings]
     findings = _with_further_steps(findings, fitted, settings, say)
     best = _simplest(findings)
@@ -343,6 +347,7 @@ def _fitted(
     x: Float[np.ndarray, " unknowns"],
     blurs: tuple[int, ...],
     *,
+    limits: tuple[float, ...] = (),
     report: Callable[[str], None] = lambda text: None,
 ) -> Finding:
     """Returns a hypothesis after steps of all unknowns, of which each is reported."""
@@ -357,6 +362,7 @@ def _fitted(
             settings.rays,
             _OUTLIERS,
             seed=settings.seed + len(blurs),
+            limits=limits,
         ),
         outlines=outlines,
         progress=lambda number, facts: report(

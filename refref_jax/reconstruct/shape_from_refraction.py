@@ -45,8 +45,9 @@ _INDEX_DEVIATION, _INDEX_STEP = 0.02, 0.02
 # The same of the logarithm of a tint.
 _TINT_DEVIATION, _TINT_STEP = 1.0, 0.3
 
-# Pixels of a look at one index, blur of the backdrop for these, and of the steps from the best.
-_LOOK, _LOOK_BLUR, _INDEX_BLURS = 8192, 2, (2, 1, 0, 0)
+# Pixels of a look at one index, blur of the backdrop for these, and of the steps from the best,
+# which have twice the pixels; the standard error has four times.
+_LOOK, _LOOK_BLUR, _INDEX_BLURS = 4096, 2, (2, 1, 0, 0)
 
 # Half-width of the parabola for the standard error of an index.
 _APART = 0.01
@@ -54,11 +55,13 @@ _APART = 0.01
 # Share of the vertices that have several normals, above which a mesh has creases.
 _CREASED = 0.02
 
-# Steps of families with few unknowns, without blur, and the pixels of each.
-_FAMILY_STEPS, _FAMILY_RAYS = 4, 20_000
+# Steps of families with few unknowns, without blur, the pixels of each, and the error of a step
+# above which a family will explain nothing, sRGB.
+_FAMILY_STEPS, _FAMILY_RAYS, _HOPELESS = 4, 20_000, 0.1
 
-# A blur is enough if errors are at most this many times what the blur alone adds.
-_ENOUGH = 2.5
+# A blur is enough if errors are at most this many times what the blur alone adds, and number of
+# pixels that tell.
+_ENOUGH, _TELLING = 2.5, 4096
 
 # Longest edge of a mesh whose vertices are to be moved, which is the mean distance of handles, as a
 # share of its diameter; and how many times as long edges may be before they are divided.
@@ -202,7 +205,7 @@ def find_index(
     total = most_looks_at_backdrop(search, start=start)
     heights = []
     for number, rung in enumerate(ladder):
-        heights.append(glass.error(rung, _LOOK_BLUR))
+        heights.append(glass.look(rung))
         progress(number + 1, total)
     starts = [ladder[i] for i in lowest_rungs(heights, search.descents)]
     starts += [] if start is None else [start]
@@ -231,42 +234,44 @@ class _Glass:
         """Builds the scene once, for all indices."""
         self.model = SingleObject(FixedShape(mesh), INDEX_OF_AIR, deviation=1.0)
         self.traced = gauss_newton.traced_object(self.model.pose(self.model.start()))
-        self.surface = surface
-        self.few = pixels.drawn(np.random.default_rng((seed, _LOOK)), _LOOK)
-        self.many = pixels.drawn(np.random.default_rng((seed, 4 * _LOOK)), 4 * _LOOK)
+        self.surface, self.blurred = surface, photometry.blurred(surface, _LOOK_BLUR)
+        some = pixels.drawn(np.random.default_rng(seed), 4 * _LOOK)
+        few, more = (np.arange(min(n * _LOOK, len(some.views))) for n in (1, 2))
+        self.few, self.more, self.most = some.chosen(few), some.chosen(more), some
 
     def at(self, index: float) -> TracedObject:
         """Returns the scene with an index."""
-        scene = self.traced.scene
-        interfaces = self.model.pose(np.array([index])).interfaces
-        return self.traced._replace(scene=scene._replace(interfaces=interfaces))
+        return self.traced.with_interfaces(self.model.pose(np.array([index])).interfaces)
 
-    def error(self, index: float, blur: int) -> float:
+    def look(self, index: float) -> float:
+        """Returns the mean error at an index, of few pixels before a blurred backdrop."""
+        return float(gauss_newton.errors_of(self.at(index), self.blurred, self.few).mean())
+
+    def error(self, index: float) -> float:
         """Returns the mean error at an index."""
-        seen = photometry.blurred(self.surface, blur)
-        return float(gauss_newton.errors_of(self.at(index), seen, self.few).mean())
+        return float(gauss_newton.errors_of(self.at(index), self.surface, self.more).mean())
 
     def descend(self, begin: float, search: IndexSearch) -> Descent:
         """Takes Gauss-Newton steps, none longer than a rung."""
-        indices, errors = [begin], [self.error(begin, 0)]
+        indices, errors = [begin], [self.error(begin)]
         for blur in _INDEX_BLURS:
             x, seen = np.array([indices[-1]]), photometry.blurred(self.surface, blur)
             light = gauss_newton.linearise(
-                self.model.pose(x), self.at(x[0]), seen, self.few, Steps()
+                self.model.pose(x), self.at(x[0]), seen, self.more, Steps()
             )
             step = -float(light.gradient[0] / max(light.matrix[0, 0], 1e-30))
             step = min(max(step, -search.spacing), search.spacing)
             indices.append(min(max(indices[-1] + step, search.lowest), search.highest))
-            errors.append(self.error(indices[-1], 0))
+            errors.append(self.error(indices[-1]))
         return Descent(tuple(indices), tuple(errors))
 
     def deviation(self, index: float) -> float:
         """Returns the standard deviation of the minimum."""
         triple = [
-            gauss_newton.errors_of(self.at(index + side * _APART), self.surface, self.many)
+            gauss_newton.errors_of(self.at(index + side * _APART), self.surface, self.most)
             for side in (-1.0, 0.0, 1.0)
         ]
-        return scatter_of_bottoms(np.stack(triple), self.many.views, _APART)
+        return scatter_of_bottoms(np.stack(triple), self.most.views, _APART)
 
 
 def fit_shapes(
@@ -313,7 +318,7 @@ def fit_shapes(
         model = SingleObject(shape, index, deviation=deviation)
         fit = task.fit(
             model,
-            Steps(blurs, rays=_FAMILY_RAYS, seed=seed),
+            Steps(blurs, _FAMILY_RAYS, seed=seed, limits=(_HOPELESS,) * len(blurs)),
             functools.partial(_report, progress, label, begin, total),
         )
         trials.append(task.judged(shape.name, model, fit))
@@ -463,6 +468,7 @@ def first_blur(candidate: Candidate, surface: Backdrop, pixels: Photographs) -> 
     light ends beyond the detail of the backdrop, errors are many times larger.
     """
     traced = gauss_newton.traced_object(candidate)
+    pixels = pixels.chosen(np.arange(0, len(pixels.views), -(-len(pixels.views) // _TELLING)))
     sharp = photometry.predict(traced, surface, pixels.rays).linear
     most = len(surface.mips) - 2
     for halvings in range(1, most + 1):

@@ -2,6 +2,7 @@
 
 import functools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -460,6 +461,31 @@ def test_a_wide_scale_weighs_a_fault_that_few_pixels_see(world, glass, seen):
 def test_a_fit_ends_after_two_steps_that_gain_little(world, glass, seen):
     settings = Steps(blurs=(1, 0, 0, 0, 0), rays=2048, judges=1024, gain=0.9, least=0.0)
     assert len(gauss_newton.fit(glass, glass.start(), world, seen, settings=settings).steps) == 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("limit, steps", [(1.0, 5), (1e-6, 4)])
+def test_a_fit_is_given_up_where_it_falls_behind_after_three_steps(
+    world, glass, seen, limit, steps
+):
+    settings = Steps((1, 0, 0, 0, 0), 2048, 1024, least=0.0, limits=(limit,) * 5)
+    fit = gauss_newton.fit(glass, glass.start(), world, seen, settings=settings)
+    assert len(fit.steps) == steps
+
+
+def test_scenes_of_few_parts_have_the_same_shapes_on_the_device(ball):
+    part = ball.pose(ball.start())
+    shapes = set()
+    for count in (1, 2, 4):
+        indices, parents = [_INDEX] + [1.0] * (count - 1), [NO_PARENT] + [0] * (count - 1)
+        body = gauss_newton.traced_object(
+            Candidate((part,) * count, nested(indices, parents), *2 * [np.zeros((count, 1))])
+        )
+        assert body.parts == count
+        kept = np.asarray(body.scene.interfaces.index_inside)[:count]
+        np.testing.assert_allclose(kept, indices)
+        shapes.add(jax.tree.map(np.shape, body.scene.interfaces))
+    assert len(shapes) == 1
 
 
 @pytest.mark.slow
