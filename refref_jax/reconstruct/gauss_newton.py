@@ -58,7 +58,7 @@ _DARK, _FULL = 2e-3, 0.1
 # Pixels where less of the light was followed, or that end where fewer pixels saw the backdrop
 # directly, do not count. Unknowns above which a sample estimates their covariance's size. First
 # steps, which do not show if a fit will succeed. Ratio of errors below which a step may be doubled.
-_FOLLOWED, _SEEN, _MANY, _FIRST, _WORTH = 0.7, 0.5, 1000, 3, 0.995
+_FOLLOWED, _SEEN, _MANY, _FIRST, _WORTH = 0.7, 0.5, 1000, 2, 0.995
 
 
 class Candidate(NamedTuple):
@@ -129,7 +129,7 @@ class Steps:
         each. Without it, a fault that few pixels see has no weight.
       gain: least relative gain; the fit ends after two steps in a row, without blur, of less.
       limits: error of the judges of each step, sRGB, above which the fit is given up; the first
-        three steps have none.
+        two steps have none.
     """
 
     blurs: tuple[int, ...] = (2, 1, 0, 0, 0, 0)

@@ -9,6 +9,8 @@ Source: ours; the paper (arXiv 2505.05848) smooths by hand, and trains the index
 
 import dataclasses
 import functools
+import itertools
+import threading
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -16,6 +18,7 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Float
 
+from refref_jax.compilation import at_once
 from refref_jax.geometry.triangle_meshes import Mesh, diameter, smooth_groups, with_short_edges
 from refref_jax.optics.interface_rules import NO_PARENT, nested
 from refref_jax.optics.media import INDEX_OF_AIR
@@ -192,7 +195,8 @@ def find_index(
       pixels: pixels that see the object.
       search: ladder, and number of rungs from which to begin.
       start: index that the user expects, from which steps begin, too.
-      progress: function called with the number of looks and steps done, and their number.
+      progress: function called with the number of looks and steps done, and their number; by one
+        thread at a time.
       seed: seed of the draws.
 
     Raises:
@@ -203,10 +207,15 @@ def find_index(
     glass = _Glass(mesh, surface, pixels, seed)
     ladder = rungs(search)
     total = most_looks_at_backdrop(search, start=start)
-    heights = []
-    for number, rung in enumerate(ladder):
-        heights.append(glass.look(rung))
-        progress(number + 1, total)
+    done, lock = itertools.count(1), threading.Lock()
+
+    def look(rung: float) -> float:
+        error = glass.look(rung)
+        with lock:
+            progress(next(done), total)
+        return error
+
+    heights = at_once(look, ladder)
     starts = [ladder[i] for i in lowest_rungs(heights, search.descents)]
     starts += [] if start is None else [start]
     ways = []

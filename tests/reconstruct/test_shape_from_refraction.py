@@ -464,10 +464,8 @@ def test_a_fit_ends_after_two_steps_that_gain_little(world, glass, seen):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("limit, steps", [(1.0, 5), (1e-6, 4)])
-def test_a_fit_is_given_up_where_it_falls_behind_after_three_steps(
-    world, glass, seen, limit, steps
-):
+@pytest.mark.parametrize("limit, steps", [(1.0, 5), (1e-6, 3)])
+def test_a_fit_is_given_up_where_it_falls_behind_after_two_steps(world, glass, seen, limit, steps):
     settings = Steps((1, 0, 0, 0, 0), 2048, 1024, least=0.0, limits=(limit,) * 5)
     fit = gauss_newton.fit(glass, glass.start(), world, seen, settings=settings)
     assert len(fit.steps) == steps
