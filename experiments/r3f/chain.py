@@ -30,7 +30,7 @@ _INDEX_FOLDER = "index"
 
 Say = Callable[[str], None]
 
-_Known = Callable[[], Resolved]
+_Background = Callable[[], Resolved]
 
 
 def reconstruct(
@@ -64,8 +64,8 @@ def reconstruct(
     with atomic_files.hold(out):
         found = records.read(out)  # another process may have finished it meanwhile
         scene = field_surface.masked_scene(scene, out, config)
-        known = functools.cache(lambda: _known_background(scene, out, config))
-        families = _takes_families(config, known)
+        background = functools.cache(lambda: _resolve_background(scene, out, config))
+        families = _takes_families(config, background)
         if not _has_surface(out, found, families):
             read = "images" if config.geometry in field_surface.NAMES else "masks"
             say(f"geometry: {config.geometry} of the training {read}, {config.resolution} cells")
@@ -76,10 +76,12 @@ def reconstruct(
             records.write(out, found)
         say(_describe_geometry(found))
         if found.index is None:
-            found = dataclasses.replace(found, index=_index(scene, out, found, known), report=None)
+            found = dataclasses.replace(
+                found, index=_index(scene, out, found, background), report=None
+            )
             records.write(out, found)
         say(describe_index(found.index))
-        found = _refined(scene, out, found, known, say)
+        found = _refined(scene, out, found, background, say)
         configuration.write(out / INDEX_FILE, object_source.index_facts(found))
         if found.report is None or not report.is_there(out):
             found = dataclasses.replace(found, report=report.run(scene, out, found, compare))
@@ -183,14 +185,14 @@ def describe_index(index: IndexFacts) -> str:
     return f"index of refraction: {index.index:.4f} +- {index.error:.4f} ({index.source})"
 
 
-def _index(scene: Path, out: Path, found: Reconstruction, known: _Known) -> IndexFacts:
+def _index(scene: Path, out: Path, found: Reconstruction, background: _Background) -> IndexFacts:
     config = found.config
     if config.index is not None:
         return IndexFacts("given", config.index, None, None)
     folder = out / _INDEX_FOLDER
     folder.mkdir(exist_ok=True)
     mesh = object_source.read_mesh(out, found)
-    estimate = index_stage.run(scene, mesh, folder, seed=config.seed, wanted=known())
+    estimate = index_stage.run(scene, mesh, folder, seed=config.seed, wanted=background())
     if not math.isfinite(estimate.deviation):
         if config.refinement == "light":  # which may find out that the object is not solid
             return IndexFacts("estimated", estimate.index, None, estimate.error)
@@ -206,13 +208,13 @@ def _refuse_index(out: Path, index: float) -> NoReturn:
 
 
 def _refined(
-    scene: Path, out: Path, found: Reconstruction, known: _Known, say: Say
+    scene: Path, out: Path, found: Reconstruction, background: _Background, say: Say
 ) -> Reconstruction:
     """Refines the object by light, if requested and not done yet."""
     there = found.light is not None and object_source.are_there(out, found)
     if found.config.refinement == "light" and not there:
         bare = dataclasses.replace(found, light=None, report=None)
-        found = dataclasses.replace(bare, light=_light(scene, out, bare, known))
+        found = dataclasses.replace(bare, light=_light(scene, out, bare, background))
         records.write(out, found)
     if found.light is not None:
         say(_describe_light(found.light))
@@ -232,24 +234,24 @@ def _has_surface(out: Path, found: Reconstruction, families: bool) -> bool:
     return geometry_stage.is_there(out, facts)
 
 
-def _takes_families(config: ReconstructionConfig, known: _Known) -> bool:
+def _takes_families(config: ReconstructionConfig, background: _Background) -> bool:
     """Returns whether outlines choose a family of shapes: in front of a field, light cannot."""
     if config.refinement != "light" or config.geometry in field_surface.NAMES:
         return False
-    return known().model.config.backdrop is None
+    return background().model.config.backdrop is None
 
 
-def _known_background(scene: Path, out: Path, config: ReconstructionConfig) -> Resolved:
+def _resolve_background(scene: Path, out: Path, config: ReconstructionConfig) -> Resolved:
     """Returns how the background is learned."""
     names = "space", "radius", "centre", "exposure", "seed"
     given: dict[str, Any] = {name: getattr(config, name) for name in names}
     return index_stage.resolve_background(scene, out / _INDEX_FOLDER, **given)
 
 
-def _light(scene: Path, out: Path, found: Reconstruction, known: _Known) -> LightFacts:
+def _light(scene: Path, out: Path, found: Reconstruction, background: _Background) -> LightFacts:
     folder = out / _INDEX_FOLDER
     folder.mkdir(exist_ok=True)
-    surface = index_stage.learn_backdrop(scene, folder, wanted=known())
+    surface = index_stage.learn_backdrop(scene, folder, wanted=background())
     return light_stage.run(
         scene,
         object_source.read_mesh(out, found),

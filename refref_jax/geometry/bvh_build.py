@@ -25,7 +25,7 @@ _BACKWARDS = ((np.arange(OCTANTS)[:, None] >> np.arange(3)) & 1).astype(bool)
 # Relative difference of costs that count as equal: rounding must not choose between them.
 _TIE = 1e-9
 
-# Rows of tables of small meshes that are filled up, and fewest rows of those of larger ones.
+# Rows of the tables of small meshes after they are filled up, and the fewest of larger meshes.
 _FEW_ROWS, _MANY_ROWS = 4096, 1 << 17
 
 
@@ -383,7 +383,7 @@ def _filled(rows: np.ndarray, axis: int = 0) -> np.ndarray:
 
 
 def spare_rows(count: int) -> int:
-    """Returns how many rows `filled_up` adds to this many: up to 4096, 131,072 or a power of two.
+    """Returns how many rows `filled_up` adds, to reach 4096, 131,072 or a power of two above.
 
     The families and vessels that are fitted to an object have some ten thousand faces, as its mesh
     from masks has: one program serves them all.

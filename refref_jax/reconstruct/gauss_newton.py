@@ -56,8 +56,8 @@ _LEAST_SCALE, _SCALE, _NARROWING, _LEAST_NOISE = 0.02, 1.5, 0.9, 0.005
 _DARK, _FULL = 2e-3, 0.1
 
 # Pixels where less of the light was followed, or that end where fewer pixels saw the backdrop
-# directly, do not count. Unknowns above which a sample estimates their covariance's size. First
-# steps, which do not show if a fit will succeed. Ratio of errors below which a step may be doubled.
+# directly, do not count. Unknowns above which a sample estimates their covariance's size. Number of
+# first steps, which no limit ends. Ratio of errors below which a step may be doubled.
 _FOLLOWED, _SEEN, _MANY, _FIRST, _WORTH = 0.7, 0.5, 1000, 2, 0.995
 
 
@@ -128,8 +128,8 @@ class Steps:
       widest: least scale of the robust weights in the first step, sRGB; it falls by a tenth in
         each. Without it, a fault that few pixels see has no weight.
       gain: least relative gain; the fit ends after two steps in a row, without blur, of less.
-      limits: error of the judges of each step, sRGB, above which the fit is given up; the first
-        two steps have none.
+      limits: largest error of the judges of each step, sRGB; a fit above it is given up, but not in
+        its first two steps.
     """
 
     blurs: tuple[int, ...] = (2, 1, 0, 0, 0, 0)
@@ -437,7 +437,7 @@ def _by_unknowns(
         bent = scipy.sparse.csr_array(by_index) @ candidate.by_indices
         return moved @ by_vertices + turned @ by_normals + bent
 
-    return _stacked(at_once(of_rays, np.array_split(np.arange(len(met)), 2)))
+    return _stacked(at_once(of_rays, np.array_split(np.arange(len(met)), min(2, len(met)))))
 
 
 def _scattered(

@@ -99,7 +99,8 @@ class SearchSettings:
       last_rays: number of pixels of a step of all unknowns; twice as many of the finest steps.
       rivals: hypotheses whose error is above that of the best by more than this factor are left
         out before all unknowns are fitted.
-      close: the same factor before these further steps, and for steps from other levels.
+      close: the same factor before these further steps; steps from another level are given up above
+        it.
       seed: seed of the draws.
     """
 

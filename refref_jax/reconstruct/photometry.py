@@ -29,7 +29,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax import numerics
-from refref_jax.compilation import at_once, jit_quickly, traced_once
+from refref_jax.compilation import at_once, jit_quickly, threads, traced_once
 from refref_jax.geometry import bvh_build
 from refref_jax.geometry.bvh import NO_PRIMITIVE
 from refref_jax.geometry.bvh_build import Division
@@ -47,10 +47,9 @@ from refref_jax.sampling.scene_bounds import Domain
 MAIN = PathSettings(max_bends=8, reflections="all", min_throughput=TREE.min_throughput)
 """The main path: 8 bends are enough for 99 % of the pixels of a torus or of a filled flask."""
 
-# Number of rays traced at once on a CPU (the same for any number of rays: one compilation, and few
-# enough that two cores share the judges of a step), and largest number of taps along each axis of a
-# footprint.
-_TILE = 4096
+# Number of rays traced at once by all threads (the same for any number of rays: one compilation),
+# and largest number of taps along each axis of a footprint.
+_TILE = 8192
 _TAPS = 3
 
 # Half the width of the difference that gives the slope of the radiance, in cells of the resolution
@@ -60,7 +59,8 @@ _HALF_WIDTH = 0.5
 # Light beside the main path that is below this share has no colour of its own.
 _LITTLE = 0.01
 
-# Numbers of interfaces on the device: those without faces let scenes of few parts share a program.
+# Scenes have this many interfaces on the device, or else a multiple of the second number: those
+# without faces let them share a program.
 _FEW_PARTS, _MORE_PARTS = 4, 16
 
 _Tree = TypeVar("_Tree")
@@ -334,7 +334,7 @@ def _encode(linear: Float[ArrayLike, "*rays 3"]) -> Float[Array, "*rays 3"]:
 
 def _in_tiles(render: Callable[[Rays], _Tree], rays: Rays) -> _Tree:
     """Returns the results for all rays, as NumPy arrays."""
-    count, tile = rays.radii.shape[0], images.on_this_device(_TILE)
+    count, tile = rays.radii.shape[0], _TILE // threads()
 
     def see(start: int) -> _Tree:
         part, _ = images.crop(rays, None, start, tile)

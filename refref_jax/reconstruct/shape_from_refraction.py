@@ -10,6 +10,7 @@ Source: ours; the paper (arXiv 2505.05848) smooths by hand, and trains the index
 import dataclasses
 import functools
 import itertools
+import math
 import threading
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -48,8 +49,8 @@ _INDEX_DEVIATION, _INDEX_STEP = 0.02, 0.02
 # The same of the logarithm of a tint.
 _TINT_DEVIATION, _TINT_STEP = 1.0, 0.3
 
-# Pixels of a look at one index, blur of the backdrop for these, and of the steps from the best,
-# which have twice the pixels; the standard error has four times.
+# Pixels of a look at one index, blur of the backdrop for these, and of the steps from the best.
+# Steps have twice as many pixels, the standard error has four times as many.
 _LOOK, _LOOK_BLUR, _INDEX_BLURS = 4096, 2, (2, 1, 0, 0)
 
 # Half-width of the parabola for the standard error of an index.
@@ -58,8 +59,8 @@ _APART = 0.01
 # Share of the vertices that have several normals, above which a mesh has creases.
 _CREASED = 0.02
 
-# Steps of families with few unknowns, without blur, the pixels of each, and the error of a step
-# above which a family will explain nothing, sRGB.
+# Steps of families with few unknowns, without blur, the pixels of each, and the error of such a
+# step above which a family will explain nothing, sRGB.
 _FAMILY_STEPS, _FAMILY_RAYS, _HOPELESS = 4, 20_000, 0.1
 
 # A blur is enough if errors are at most this many times what the blur alone adds, and number of
@@ -324,10 +325,11 @@ def fit_shapes(
     for shape in few:
         begin, label = done, shape.name
         blurs = (*range(blur, 0, -1), *[0] * _FAMILY_STEPS)
+        limits = (math.inf,) * blur + (_HOPELESS,) * _FAMILY_STEPS  # a blur alone makes errors
         model = SingleObject(shape, index, deviation=deviation)
         fit = task.fit(
             model,
-            Steps(blurs, _FAMILY_RAYS, seed=seed, limits=(_HOPELESS,) * len(blurs)),
+            Steps(blurs, _FAMILY_RAYS, seed=seed, limits=limits),
             functools.partial(_report, progress, label, begin, total),
         )
         trials.append(task.judged(shape.name, model, fit))
@@ -477,7 +479,7 @@ def first_blur(candidate: Candidate, surface: Backdrop, pixels: Photographs) -> 
     light ends beyond the detail of the backdrop, errors are many times larger.
     """
     traced = gauss_newton.traced_object(candidate)
-    pixels = pixels.chosen(np.arange(0, len(pixels.views), -(-len(pixels.views) // _TELLING)))
+    pixels = pixels.chosen(np.arange(0, len(pixels.views), math.ceil(len(pixels.views) / _TELLING)))
     sharp = photometry.predict(traced, surface, pixels.rays).linear
     most = len(surface.mips) - 2
     for halvings in range(1, most + 1):

@@ -473,8 +473,8 @@ def test_a_fit_is_given_up_where_it_falls_behind_after_two_steps(world, glass, s
 
 def test_scenes_of_few_parts_have_the_same_shapes_on_the_device(ball):
     part = ball.pose(ball.start())
-    shapes = set()
-    for count in (1, 2, 4):
+    shapes = {}
+    for count in (1, 2, 4, 5, 16):
         indices, parents = [_INDEX] + [1.0] * (count - 1), [NO_PARENT] + [0] * (count - 1)
         body = gauss_newton.traced_object(
             Candidate((part,) * count, nested(indices, parents), *2 * [np.zeros((count, 1))])
@@ -482,8 +482,27 @@ def test_scenes_of_few_parts_have_the_same_shapes_on_the_device(ball):
         assert body.parts == count
         kept = np.asarray(body.scene.interfaces.index_inside)[:count]
         np.testing.assert_allclose(kept, indices)
-        shapes.add(jax.tree.map(np.shape, body.scene.interfaces))
-    assert len(shapes) == 1
+        other = body.with_interfaces(nested(indices, parents))
+        shapes[count] = jax.tree.map(np.shape, other.scene.interfaces)
+        assert shapes[count] == jax.tree.map(np.shape, body.scene.interfaces)
+    assert shapes[1] == shapes[2] == shapes[4] != shapes[5] == shapes[16]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_derivatives_of_few_rays_are_rows_of_those_of_many(world, glass, seen, count):
+    candidate = glass.pose(glass.start())
+    body = gauss_newton.traced_object(candidate)
+    predicted = photometry.predict(body, world, seen.rays)
+    many = photometry.sensitivities(body, world, seen.rays, predicted)
+    few = jax.tree.map(lambda x: x[:count], many)
+    assert many.by_indices.shape[-1] == many.crossings.shape[-1] == many.lengths.shape[-1] == 1
+    rows = [np.asarray(_dense(gauss_newton._by_unknowns(candidate, body, x))) for x in (few, many)]
+    np.testing.assert_array_equal(rows[0], rows[1][: 3 * count])
+
+
+def _dense(matrix):
+    return matrix.toarray() if scipy.sparse.issparse(matrix) else matrix
 
 
 @pytest.mark.slow
@@ -546,6 +565,25 @@ def test_a_family_is_chosen_where_it_explains_the_judges(world, ball, seen, judg
     assert _turned(chosen.mesh) < 0.2
     assert trials[2].error < 0.5 * trials[0].error
     assert told == sorted(told) and told[-1] == 1.0 and 0.0 < told[0] < 0.2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("blur", [0, 4])
+def test_a_family_that_explains_nothing_is_given_up_without_blur(
+    world, ball, seen, judges, monkeypatch, blur
+):
+    mesh, limits = _dented(ball), []
+
+    def fit(model, x, *_, settings, **options):
+        limits.append(settings.limits)
+        return Fit(x, np.eye(len(x)), ())
+
+    monkeypatch.setattr(gauss_newton, "fit", fit)
+    monkeypatch.setattr(shape_from_refraction, "first_blur", lambda *_: blur)
+    _one_family(monkeypatch, Sphere(_ORIGIN, 1.0), mesh)
+    options = {"is_enough": lambda trials: True}
+    shape_from_refraction.fit_shapes(mesh, _INDEX, world, seen, judges, **options)
+    assert limits == [(np.inf,) * blur + (0.1,) * 4]
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ import functools
 import json
 import shutil
 import sys
+import types
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -320,7 +321,9 @@ def _stub_light(monkeypatch, *, after, growth=1.001, index=1.51):
     monkeypatch.setattr(light_stage, "fit", fit)
     monkeypatch.setattr(light_figures, "draw", lambda path, *_: path.write_bytes(b"figure"))
     monkeypatch.setattr(light_stage, "look_at_opaque_parts", lambda *_, **options: _SHAPELESS)
-    monkeypatch.setattr(index_stage, "has_backdrop", lambda *args, **options: True)
+    solved = types.SimpleNamespace(config=types.SimpleNamespace(backdrop="surface"))
+    resolved = types.SimpleNamespace(model=solved)
+    monkeypatch.setattr(index_stage, "resolve_background", lambda *_, **options: resolved)
     monkeypatch.setattr(index_stage, "learn_backdrop", lambda *_, **options: "surface")
     return called
 

@@ -188,6 +188,7 @@ def test_a_background_that_was_begun_with_other_walls_is_not_taken(
     for _ in range(2):
         with pytest.raises(KeyboardInterrupt):
             learn(space="bounded", radius=5.0)
+    assert run_folder.read_config(tmp_path / "background").model.iterations == 24
     for space, radius in (("bounded", 9.0), ("unbounded", 5.0)):
         with pytest.raises(ValueError, match="another --background or --radius"):
             learn(space=space, radius=radius)
