@@ -385,8 +385,8 @@ def _filled(rows: np.ndarray, axis: int = 0) -> np.ndarray:
 def spare_rows(count: int) -> int:
     """Returns how many rows `filled_up` adds, to reach 4096, 131,072 or a power of two above.
 
-    The families and vessels that are fitted to an object have some ten thousand faces, as its mesh
-    from masks has: one program serves them all.
+    The families and vessels that are fitted to an object have tens of thousands of faces, as its
+    mesh from masks has: one program serves them all.
     """
     few = count <= _FEW_ROWS
     return (_FEW_ROWS if few else max(_MANY_ROWS, 1 << (count - 1).bit_length())) - count

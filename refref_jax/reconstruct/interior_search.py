@@ -210,9 +210,9 @@ def search(
     leading = min(findings, key=_error)
     steps = leading.trial.fit.steps
     limits = tuple(settings.close * min(step.before, step.after) for step in steps)
-    behind = functools.partial(fit_all, limits=limits)
+    fit_rival = functools.partial(fit_all, limits=limits)
     others = _with_other_levels(leading, settings)
-    for moved in _fit_each(behind, others, "another level", report):
+    for moved in _fit_each(fit_rival, others, "another level", report):
         findings = [_better(moved, each) for each in findings]
     findings = _with_further_steps(findings, fitted, settings, say)
     best = _simplest(findings)
