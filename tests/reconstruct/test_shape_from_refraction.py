@@ -471,6 +471,38 @@ def test_a_fit_is_given_up_where_it_falls_behind_after_two_steps(world, glass, s
     assert len(fit.steps) == steps
 
 
+class _Line:
+    """A body that does not change with its unknown, whose steps are 1 long, and at most 10."""
+
+    def __init__(self, body):
+        self.body, self.at = body, 0.0
+
+    def start(self):
+        return np.zeros(1)
+
+    def pose(self, x):
+        self.at = x[0]
+        return self.body
+
+    def prior(self, x):
+        return np.ones((1, 1)), -np.ones(1)
+
+    def scales(self):
+        return np.full(1, 10.0)
+
+
+@pytest.mark.parametrize("gain, reached", [(0.1, 8.0), (0.006, 8.0), (0.004, 1.0)])
+def test_a_step_is_doubled_where_it_explains_half_a_percent(
+    world, glass, seen, monkeypatch, gain, reached
+):
+    line, none, square = _Line(glass.pose(glass.start())), np.zeros(1), np.zeros((1, 1))
+    nothing = gauss_newton.Equations(square, none, by_view=square, of_pixels=square)
+    monkeypatch.setattr(gauss_newton, "linearise", lambda *_, **__: nothing)
+    monkeypatch.setattr(gauss_newton, "errors_of", lambda *_: np.exp([-gain * line.at]))
+    fit = gauss_newton.fit(line, line.start(), world, seen, settings=Steps(blurs=(0,)))
+    assert fit.x == pytest.approx(reached, rel=2e-3)  # the damping is 1e-3
+
+
 def test_scenes_of_few_parts_have_the_same_shapes_on_the_device(ball):
     part = ball.pose(ball.start())
     shapes = {}
