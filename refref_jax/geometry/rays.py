@@ -48,6 +48,26 @@ class Rays(NamedTuple):
     strata: Int[Array, "*rays 3"] | None = None
 
 
+def chord(
+    radius: float | Float[Array, ""], origin: Float[Array, "3"], direction: Float[Array, "3"]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Returns the chord of a line in a sphere around the origin.
+
+    Args:
+      radius: radius of the sphere, world units.
+      origin: a point of the line.
+      direction: unit direction of the line.
+
+    Returns:
+      The distance from `origin` to the middle of the chord, and half the length of the chord. If
+      the line misses the sphere, half the length is 0 and the middle is the line's nearest point to
+      the centre.
+    """
+    along = numerics.dot(origin, direction)
+    beyond = numerics.dot(origin, origin) - jnp.square(radius)
+    return -along, numerics.safe_sqrt(jnp.square(along) - beyond)
+
+
 def orthonormal_basis(
     direction: Float[Array, "3"],
 ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:

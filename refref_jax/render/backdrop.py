@@ -36,6 +36,7 @@ from jaxtyping import Array, Float, Int
 from refref_jax import numerics
 from refref_jax.choices import Space
 from refref_jax.compilation import native_loop, record, with_record
+from refref_jax.geometry.rays import chord
 from refref_jax.optics.light_paths import PathEnds
 from refref_jax.sampling import scene_bounds
 from refref_jax.sampling.scene_bounds import Domain
@@ -205,7 +206,7 @@ def to_surface(
         distance = numerics.safe_divide(wall - from_centre[axis], direction[axis])
         return from_centre + distance * direction
     if domain.space == "spherical":
-        middle, half = scene_bounds.chord(domain.radius, from_centre, direction)
+        middle, half = chord(domain.radius, from_centre, direction)
         return from_centre + (middle + half) * direction
     distance = scene_bounds.exit_distance(domain, origin, direction)
     return from_centre + jnp.where(jnp.isfinite(distance), distance, 0.0) * direction

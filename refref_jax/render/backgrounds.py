@@ -20,10 +20,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax import numerics
+from refref_jax.geometry.rays import chord
 from refref_jax.optics import light_paths
 from refref_jax.optics.light_paths import LightPaths, PathEnds
 from refref_jax.render import pixels
-from refref_jax.sampling import scene_bounds
 
 Radiance = Callable[[Float[Array, "3"], Float[Array, "3"]], Float[Array, "3"]]
 """Radiance along one ray: function of origin and unit direction, world units, to linear RGB."""
@@ -187,7 +187,7 @@ def sphere_radiance(
     distance is 0 (`numerics.safe_sqrt`).
     """
     origin = _from_centre(background, origin)
-    middle, half = scene_bounds.chord(background.radius, origin, direction)
+    middle, half = chord(background.radius, origin, direction)
     return _look(background.texture, origin + (middle + half) * direction)
 
 

@@ -25,6 +25,7 @@ from jaxtyping import Array, Float
 from refref_jax import numerics
 from refref_jax.choices import ORIGIN, Position, Space
 from refref_jax.geometry.cameras import Cameras
+from refref_jax.geometry.rays import chord
 from refref_jax.sampling.polylines import Gaussians, Polyline
 
 _LAMBDA = -1.5
@@ -178,26 +179,6 @@ def _from_centre(domain: Domain, points: Float[Array, "*shape 3"]) -> Float[Arra
     if not any(domain.centre):
         return points
     return points - jnp.broadcast_to(jnp.asarray(domain.centre, points.dtype), points.shape)
-
-
-def chord(
-    radius: float | Float[Array, ""], origin: Float[Array, "3"], direction: Float[Array, "3"]
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Returns the chord of a line in a sphere around the origin.
-
-    Args:
-      radius: radius of the sphere, world units.
-      origin: a point of the line.
-      direction: unit direction of the line.
-
-    Returns:
-      The distance from `origin` to the middle of the chord, and half the length of the chord. If
-      the line misses the sphere, half the length is 0 and the middle is the line's nearest point to
-      the centre.
-    """
-    along = numerics.dot(origin, direction)
-    beyond = numerics.dot(origin, origin) - jnp.square(radius)
-    return -along, numerics.safe_sqrt(jnp.square(along) - beyond)
 
 
 def contract(x: Float[Array, "*shape 3"]) -> Float[Array, "*shape 3"]:
