@@ -86,8 +86,6 @@ def measure(scene: Path) -> Row:
         )
     field = ["--preset=tiny", f"--steps={_STEPS.value}"]
     found = [f"--reconstruction={made}", "--paths=tree", "--far_field=backdrop"]
-    if light.leaves_error:
-        found.append("--interior=field")
     if light.leaves_error or any(part.radiance is not None for part in light.parts):
         found += field
     return Row(

@@ -20,6 +20,9 @@ SATURATED = 254.5 / 255.0
 Position = tuple[float, float, float]
 """A point in world units."""
 
+BallOption = tuple[float, float, float, float]
+"""Centre and radius of a ball, world units."""
+
 ORIGIN: Position = (0.0, 0.0, 0.0)
 """Centre of a scene that does not state another one."""
 

@@ -16,8 +16,8 @@ from refref_jax import atomic_files
 from refref_jax.data import meshes, scene_folder, scene_names
 from refref_jax.geometry.triangle_meshes import Mesh, diameter, volume
 from refref_jax.reconstruct import ReconstructionError, occupancy
-from refref_jax.reconstruct.grids import Grid, find_isosurface
-from refref_jax.reconstruct.masks import Views, carve
+from refref_jax.reconstruct.grids import Box, Grid, find_isosurface
+from refref_jax.reconstruct.masks import Views, carve, find_box, hull_field
 from refref_jax.reconstruct.mesh_distance import carved_alone, silhouette_overlap, without_outliers
 from refref_jax.reconstruct.model_selection import shape_from_outlines
 from refref_jax.reconstruct.occupancy import OccupancyTrainingConfig
@@ -84,6 +84,16 @@ GEOMETRIES: dict[str, Callable[[Inputs, ReconstructionConfig], Grid]] = {
     **dict.fromkeys(field_surface.NAMES, _field),
 }
 """Methods by name, whose grid is negative inside the object."""
+
+
+def box_of_masks(scene: Path) -> Box:
+    """Returns a box around all that the training masks of a scene show.
+
+    Raises:
+      ValueError: if there are no masks, or no object fits them.
+    """
+    frames, masks = scene_folder.read_object_views(scene_folder.read_frames(scene, "train"))
+    return find_box(hull_field(masks, frames.cameras), masks, frames.cameras)
 
 
 def run(

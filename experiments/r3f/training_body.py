@@ -12,6 +12,7 @@ from absl import flags
 from experiments.cli import flags as cli_flags
 from experiments.r3f import flags as r3f_flags
 from experiments.runs import config_flags, refraction_indices
+from refref_jax import choices
 from refref_jax.training.config import TrainConfig
 
 if TYPE_CHECKING:
@@ -241,7 +242,7 @@ def with_parts(
     free = config.model.interior is None and not _EXCLUDE_FIELD & config.overrides()
     if free and (why := _unexplained(made)):
         say(why)
-        config = config.decided(interior="field")
+        config = config.decided(interior="field", field_ball=_ball(config))
     is_given = given_index(ior) is not None
     return config.override(ior=index) if is_given else config.decided(ior=index)
 
@@ -254,9 +255,25 @@ def _unexplained(made: Path) -> str:
     if light is None or light.after is None or not light.leaves_error:
         return ""
     return (
-        f"interior=field: the shape leaves an error of {light.after:.4f}, and a field inside the "
-        "object learns a part of it; --interior=absorbing leaves it out and is faster"
+        f"interior=field: the shape leaves an error of {light.after:.4f}, of which a field learns a "
+        "part, in the object and where masks show it; --interior=absorbing leaves it out and is "
+        "faster"
     )
+
+
+def _ball(config: TrainConfig) -> choices.BallOption | None:
+    """Returns a ball around all that the training masks show, if the far field may be a backdrop.
+
+    The reconstructed object may lack thin and opaque parts, which a field around it learns.
+    """
+    from experiments.r3f import geometry_stage
+
+    if config.model.far_field == "field":
+        return None
+    box = geometry_stage.box_of_masks(Path(config.scene.path))
+    x, y, z = 0.5 * (box.low + box.high)
+    radius = 0.5 * sum((box.high - box.low) ** 2) ** 0.5
+    return tuple(round(float(number), 4) for number in (x, y, z, radius))
 
 
 def note(run: Path, parts: Sequence[MeshPart] | None, given: str) -> None:

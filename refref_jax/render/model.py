@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 from refref_jax import numerics
 from refref_jax.choices import (
     ORIGIN,
+    BallOption,
     Footprint,
     InFront,
     Interior,
@@ -70,12 +71,16 @@ class BackdropConfig:
       in_front: model of what is in front of the surface: a `field` on opaque parts, and inside
         parts that need one, or `nothing`.
       view_dependence: dependence of radiance on the direction of light: `linear`, or `none`.
+      field_ball: centre and radius of a ball, world units, in which a field in front of the surface
+        is sampled wherever all masks show the object, inside and outside of its meshes; only inside
+        of them if `None`.
     """
 
     resolution: int
     most_taps: int = 3
     in_front: InFront = "nothing"
     view_dependence: ViewDependence = "none"
+    field_ball: BallOption | None = None
 
     @property
     def axes(self) -> int:
@@ -87,6 +92,8 @@ class BackdropConfig:
         counts = self.resolution, self.most_taps
         if min(counts) < 1:
             raise ValueError(f"Resolution and taps are {counts}. Give positive numbers.")
+        if (ball := self.field_ball) and not (all(map(math.isfinite, ball)) and ball[3] > 0.0):
+            raise ValueError(f"field_ball is {ball}. Give a centre and a positive radius.")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -173,22 +180,16 @@ class ModelConfig:
         if not self.proposals:
             raise ValueError("proposals is empty. Give at least one proposal level.")
         if not 0.0 <= self.near < self.far:
-            raise ValueError(
-                f"The distances near = {self.near} and far = {self.far} are invalid. Choose them "
-                f"such that 0 <= near < far."
-            )
+            raise ValueError(f"near is {self.near}, far {self.far}. Give 0 <= near < far.")
         if not 0.0 < self.radius < math.inf:
             raise ValueError(f"radius is {self.radius}. Give a positive, finite radius.")
         if not all(map(math.isfinite, self.centre)):
             raise ValueError(f"centre is {self.centre}. Give three finite numbers of world units.")
         if self.learned_tints < 0:
-            raise ValueError(
-                f"learned_tints is {self.learned_tints}. Give the number of parts, or 0."
-            )
-        _check_choice("space", self.space, get_args(Space))
-        _check_choice("interior", self.interior, get_args(Interior))
-        _check_choice("footprint", self.footprint, get_args(Footprint))
-        _check_choice("last_sample", self.last_sample, get_args(LastSample))
+            raise ValueError(f"learned_tints is {self.learned_tints}. Give a number of parts.")
+        kinds = {"space": Space, "interior": Interior, "footprint": Footprint}
+        for name, kind in (kinds | {"last_sample": LastSample}).items():
+            _check_choice(name, getattr(self, name), get_args(kind))
 
 
 def path_detail(config: ModelConfig, settings: PathSettings) -> Detail:
@@ -228,6 +229,20 @@ class Layers(NamedTuple):
 
     field: base.Params
     backdrop: Pyramid
+
+
+class LayersInHull(NamedTuple):
+    """Layers with a field in a ball; a type of its own, as checkpoints of `Layers` have no hull.
+
+    Attributes:
+      field: as in `Layers`.
+      backdrop: as in `Layers`.
+      hull: 1 in the cells around `field_ball` that all masks show as part of the object, else 0.
+    """
+
+    field: base.Params
+    backdrop: Pyramid
+    hull: Float[Array, "cells cells cells"]
 
 
 class Rendering(NamedTuple):
@@ -292,9 +307,9 @@ def init_params(key: Array, config: ModelConfig) -> Params:
 
         return Params((), gaussians.blank(config.splats.gaussians), None)
     colours = learned_media.init(config.learned_tints) if config.learned_tints else None
+    shape = config.backdrop
+    surface = backdrop.init(shape.resolution, axes=shape.axes) if shape else None
     if is_backdrop(config):
-        assert config.backdrop is not None
-        surface = backdrop.init(config.backdrop.resolution, axes=config.backdrop.axes)
         return Params((), surface, colours)
     field_key, *keys = jax.random.split(key, 1 + len(config.proposals))
     proposals = tuple(
@@ -302,9 +317,10 @@ def init_params(key: Array, config: ModelConfig) -> Params:
         for proposal_key, proposal in zip(keys, config.proposals, strict=True)
     )
     field = registry.init_radiance(field_key, config.field)
-    if config.backdrop is not None:
-        surface = backdrop.init(config.backdrop.resolution, axes=config.backdrop.axes)
+    if shape is not None and surface is not None:
         field = Layers(field, surface)
+        if shape.field_ball is not None:
+            field = LayersInHull(*field, jnp.zeros(3 * (scene_bounds.HULL_CELLS,)))
     gains = jnp.zeros((config.learned_gains, 3)) if config.learned_gains else None
     return Params(proposals, field, colours, gains)
 
@@ -321,7 +337,13 @@ def is_backdrop(config: ModelConfig) -> bool:
 
 def surface_of(params: Params) -> Pyramid:
     """Returns the radiance of a backdrop."""
-    return params.field.backdrop if isinstance(params.field, Layers) else params.field
+    field = params.field
+    return field.backdrop if isinstance(field, Layers | LayersInHull) else field
+
+
+def field_of(params: Params) -> base.Params:
+    """Returns the parameters of the radiance field."""
+    return params.field.field if isinstance(params.field, Layers | LayersInHull) else params.field
 
 
 class FieldPoint(NamedTuple):
@@ -358,16 +380,12 @@ def look_up(
       ValueError: if the model has a backdrop or Gaussian splats instead of fields, or its field has
         sub-spaces, a surface or a deformation.
     """
-    if config.splats is not None:
-        raise ValueError(
-            "This model has Gaussian splats in place of a field, so there is no density to look "
-            "up. Train it with field=zipnerf."
-        )
-    if config.backdrop is not None:
-        raise ValueError(
-            "This model has a backdrop in place of a field, so there is no density to look up. "
-            "Train it with far_field=field."
-        )
+    for other, use in ((config.splats, "field=zipnerf"), (config.backdrop, "far_field=field")):
+        if other is not None:
+            raise ValueError(
+                "This model has splats or a backdrop in place of a field, so there is no density "
+                f"to look up. Train it with {use}."
+            )
     if registry.has_sub_spaces(config.field):
         raise ValueError(
             f"A point has no colour in fields of kind {config.field.kind}, which blends sub-spaces "

@@ -25,7 +25,7 @@ from refref_jax.fields import base, registry
 from refref_jax.fields.base import Radiance, Seen, SubSpaces, Surface, SurfaceSums
 from refref_jax.optics.light_paths import LightPaths
 from refref_jax.render import learned_media
-from refref_jax.render.model import Layers, ModelConfig, Params
+from refref_jax.render.model import ModelConfig, Params, field_of
 from refref_jax.sampling import polylines, scene_bounds, stepfun
 from refref_jax.sampling.polylines import Gaussians, Polyline, PolylinePoint
 
@@ -201,7 +201,7 @@ def path_radiance(
     warp = distance_warp(config, line)
     done = jnp.ones_like(path.radii) if progress is None else progress
     if registry.knots(config.field):
-        learned = _field_of(params), config.field, config.domain
+        learned = field_of(params), config.field, config.domain
         line, bent = learned_media.bend(*learned, line, warp, done)
         warp = distance_warp(config, line)
     samples, seen, histograms = _sampled(params, config, line, warp, jitter, anneal, done)
@@ -230,9 +230,9 @@ def foreground_radiance(
 ) -> PathRadiance:
     """Renders what is in front of a backdrop along one light path.
 
-    The field is sampled inside the objects whose interior it models, and once where the path ends
-    on an opaque surface. The accumulation is the share of the light that does not come from the
-    backdrop; arguments as in `path_radiance`.
+    The field is sampled inside objects, or in a ball around them, and where the path ends on an
+    opaque surface. The accumulation is the share of light from in front of the backdrop; arguments
+    as in `path_radiance`.
     """
     nothing = jnp.zeros_like(path.radii)
     front = Composite(jnp.zeros_like(path.throughput), nothing, nothing + jnp.inf, nothing)
@@ -240,18 +240,21 @@ def foreground_radiance(
     outside = jnp.ones((0,), bool)
     if config.interior == "field" or config.field_parts:
         line = polyline(config, path)
-        length = jnp.max(line.knots, where=jnp.isfinite(line.knots), initial=0.0)
-        far = jnp.maximum(length, scene_bounds.SHORTEST * config.radius)
+        assert line.stop is not None
+        far = jnp.maximum(line.stop, scene_bounds.SHORTEST * config.radius)
         warp = scene_bounds.DistanceWarp(0.0, far, config.radius)
         samples, seen, proposed = _sampled(params, config, line, warp, jitter, anneal)
         assert not isinstance(seen, Surface)  # `resolve` refuses a backdrop behind a surface
+        sampled, points = line.stop > 0.0, samples.points
+        if config.backdrop is not None and (ball := config.backdrop.field_ball):
+            shown = scene_bounds.values_in_ball(params.field.hull, ball, points.position) > 0.5
+            sampled &= shown | ~points.outside
 
         def weigh(density: Array) -> Array:
-            return jnp.where(length > 0.0, _weigh(config, density, samples.t), 0.0)
+            return _weigh(config, jnp.where(sampled, density, 0.0), samples.t)
 
-        weights, front = integrate(params, config, seen, samples.t, weigh=weigh)
-        front = _in_arc_length(line, front)
-        histograms = (*proposed, Histogram(samples.s, weights))
+        weights, inside = integrate(params, config, seen, samples.t, weigh=weigh)
+        front, histograms = _in_arc_length(line, inside), (*proposed, Histogram(samples.s, weights))
         outside = samples.points.outside
     if path.stop is not None:
         stop = path.stop.tau
@@ -289,7 +292,7 @@ def integrate(
         return weights, composite(weights, seen.rgb, edges, last_sample=last_sample)
     each = jax.vmap(weigh, in_axes=-1, out_axes=-1)(seen.density)
     features = jnp.sum(each[..., None] * seen.features, axis=0)
-    blend = registry.blend(_field_of(params), config.field, features)
+    blend = registry.blend(field_of(params), config.field, features)
     weights = jnp.sum(each * blend.shares[None], axis=-1)
     rgb = jnp.sum((blend.shares * jnp.sum(each, axis=0))[:, None] * blend.rgb, axis=0)
     composited = composite(weights, jnp.zeros((*weights.shape, 3)), edges, last_sample=last_sample)
@@ -306,7 +309,7 @@ def _integrate_surface(
     """Returns the same as `integrate`, of a field with a surface, by the field's optical depths."""
     lengths = jnp.maximum(jnp.diff(samples.t), 0.0) / config.radius
     depth = jax.vmap(registry.depth, in_axes=(None, None, 0, 0, 0, None))(
-        _field_of(params), config.field, seen, samples.points.direction, lengths, progress
+        field_of(params), config.field, seen, samples.points.direction, lengths, progress
     )
     weights = opaque_end(depth_weights(depth))
     return weights, composite(weights, seen.rgb, samples.t, last_sample=_last_sample(config))
@@ -337,15 +340,11 @@ def _opaque_surface(params: Params, config: ModelConfig, whole: Polyline) -> Flo
     cone = polylines.multisamples(whole, at, at, jnp.zeros_like(at), count=config.multisamples)
     cell = scene_bounds.to_unit_cube(config.domain, cone)
     direction = polylines.point_at(whole, at).direction
-    seen = registry.radiance(_field_of(params), config.field, cell, direction)
+    seen = registry.radiance(field_of(params), config.field, cell, direction)
     if not isinstance(seen, SubSpaces):
         return seen.rgb
-    blend = registry.blend(_field_of(params), config.field, seen.features)
+    blend = registry.blend(field_of(params), config.field, seen.features)
     return jnp.sum(blend.shares[:, None] * blend.rgb, axis=0)
-
-
-def _field_of(params: Params) -> base.Params:
-    return params.field.field if isinstance(params.field, Layers) else params.field
 
 
 def _sampled(
@@ -368,7 +367,7 @@ def _sampled(
         given = config.field, config.domain, straight.gaussians, straight.points, progress
         return Samples(straight.s, straight.t, *learned_media.move(learned, *given))
 
-    field = _field_of(params)
+    field = field_of(params)
     histograms: list[Histogram] = []
     for level, proposal in enumerate(config.proposals):
         # Proposals see what the field sees, but do not train the deformation.
@@ -398,6 +397,8 @@ def distance_warp(config: ModelConfig, line: Polyline) -> scene_bounds.DistanceW
 def polyline(config: ModelConfig, path: LightPaths) -> Polyline:
     """Returns the polyline that a model samples: without the segments that it takes to be empty."""
     if config.backdrop is not None:
+        if config.backdrop.field_ball is not None:
+            return polylines.path_in_ball(path, config.backdrop.field_ball)
         return polylines.inside_path(
             path, parts=None if config.interior == "field" else config.field_parts
         )

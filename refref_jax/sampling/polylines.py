@@ -21,7 +21,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax import numerics
-from refref_jax.geometry.rays import orthonormal_basis
+from refref_jax.choices import BallOption
+from refref_jax.geometry.rays import chord, orthonormal_basis
 from refref_jax.optics import light_paths
 from refref_jax.optics.light_paths import LightPaths, RayDifferential
 from refref_jax.optics.media import AMBIENT
@@ -48,8 +49,8 @@ class Polyline(NamedTuple):
         outside: truncated paths end on the background too.
       differentials: ray differential of each segment, if carried.
       radius: radius of the pixel's cone at unit distance.
-      stop: coordinate `t` at which the path ends on an opaque surface, `inf` if it does not;
-        `None` in scenes without such surfaces.
+      stop: coordinate `t` at which the path ends on an opaque surface, or at which the part of it
+        that is sampled ends; `inf` if neither does, `None` in scenes without opaque surfaces.
     """
 
     points: Float[Array, "segments 3"]
@@ -110,23 +111,61 @@ def outside_path(path: LightPaths, *, also: tuple[int, ...] = ()) -> Polyline:
 
 
 def inside_path(path: LightPaths, *, parts: tuple[int, ...] | None = None) -> Polyline:
-    """Returns one light path whose coordinate only advances inside the objects.
+    """Returns one light path whose coordinate only advances inside the objects, until its stop.
 
     Args:
       path: one light path, with all of its segments.
       parts: parts in whose media the coordinate advances; all by default.
     """
     line = whole_path(path)
-    if parts is None:
-        return _advancing(path, line, ~line.outside)
-    media = jnp.asarray([1 + part for part in parts], path.media.dtype)
-    inside = jnp.any(path.media[:, None] == media[None, :], axis=-1)
-    return _advancing(path, line, inside & ~line.outside)
+    inside = ~line.outside
+    if parts is not None:
+        media = jnp.asarray([1 + part for part in parts], path.media.dtype)
+        inside &= jnp.any(path.media[:, None] == media[None, :], axis=-1)
+    line = _advancing(path, line._replace(stop=None), inside)
+    return line._replace(stop=jnp.max(line.knots, where=jnp.isfinite(line.knots), initial=0.0))
+
+
+def path_in_ball(path: LightPaths, ball: BallOption) -> Polyline:
+    """Returns one light path whose coordinate only advances within a ball around the objects.
+
+    It begins where the path enters the ball and advances along all segments between bends. Its stop
+    is where the path leaves the ball or ends on an opaque surface; 0 for a path beside the ball.
+
+    Args:
+      path: one light path, with all of its segments.
+      ball: centre and radius of the ball, world units.
+    """
+    *centre, radius = ball
+    line, used = whole_path(path), jnp.isfinite(path.tau)
+    slots, last = jnp.arange(used.size), jnp.sum(used) - 1
+    from_centre = line.points - jnp.asarray([centre], line.points.dtype)
+    middle, half = jax.vmap(chord, in_axes=(None, 0, 0))(radius, from_centre, line.directions)
+    leave = jnp.where(half > 0.0, jnp.maximum(middle + half, 0.0), 0.0)
+    if line.stop is not None:
+        leave = jnp.minimum(leave, line.stop - line.arcs)
+    ends = jnp.where(slots == last, leave, path.ends - line.arcs)
+    enter = jnp.maximum(middle - half, 0.0)
+    starts = jnp.where(slots == 0, jnp.minimum(enter, ends), 0.0)
+    lengths = jnp.where(used, jnp.maximum(ends - starts, 0.0), 0.0)
+    points, turns = line.differentials
+    moved = line._replace(
+        points=line.points + starts[:, None] * line.directions,
+        arcs=line.arcs + starts,
+        differentials=RayDifferential(points + starts[:, None, None] * turns, turns),
+        stop=None,
+    )
+    return _with_lengths(path, moved, lengths)._replace(stop=jnp.sum(lengths))
 
 
 def _advancing(path: LightPaths, line: Polyline, sampled: Bool[Array, " segments"]) -> Polyline:
     """Returns a light path whose coordinate only advances along some of its segments."""
     lengths = jnp.where(jnp.isfinite(path.ends) & sampled, path.ends - line.arcs, 0.0)
+    return _with_lengths(path, line, lengths)
+
+
+def _with_lengths(path: LightPaths, line: Polyline, lengths: Float[Array, " segments"]) -> Polyline:
+    """Returns a light path along whose segments the coordinate advances by given lengths."""
     # Summed separately for each segment, in the same order, so that a segment of length 0 starts
     # exactly where the next one does. A running sum would round them apart, and a sample could fall
     # between.

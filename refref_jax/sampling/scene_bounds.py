@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from refref_jax import numerics
-from refref_jax.choices import ORIGIN, Position, Space
+from refref_jax.choices import ORIGIN, BallOption, Position, Space
 from refref_jax.geometry.cameras import Cameras
 from refref_jax.geometry.rays import chord
 from refref_jax.sampling.polylines import Gaussians, Polyline
@@ -39,6 +39,9 @@ costs 2.7 dB.
 
 SHORTEST = 1e-3
 """Minimum length of a path, in units of the scene radius: `s` keeps four digits in float32."""
+
+HULL_CELLS = 96
+"""Cells per side of the grid that tells where in its ball a field is sampled."""
 
 _NEAR = 0.05
 _FAR_UNBOUNDED = 1000.0
@@ -261,3 +264,21 @@ def _ladder(
     warp: DistanceWarp, t: float | Float[Array, "*shape"]
 ) -> float | Float[Array, "*shape"]:
     return (1.0 + t / _scale(warp)) ** _LAMBDA
+
+
+def values_in_ball(
+    grid: Float[Array, "cells cells cells"], ball: BallOption, points: Float[Array, "points 3"]
+) -> Float[Array, " points"]:
+    """Returns the values of the cells of points, on a grid of the cube around a ball.
+
+    Args:
+      grid: values of the cells.
+      ball: centre and radius of the ball, world units.
+      points: points in world units; those outside the cube have the value 0.
+    """
+    *centre, radius = ball
+    half = 0.5 * grid.shape[0]
+    offset = (points - jnp.asarray([centre], points.dtype)) / radius
+    cells = jnp.floor(half * (offset + 1.0)).astype(jnp.int32)
+    held = jnp.clip(cells, 0, grid.shape[0] - 1)
+    return jnp.where(jnp.all(cells == held, axis=-1), grid[tuple(held.T)], 0.0)

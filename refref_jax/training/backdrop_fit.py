@@ -15,16 +15,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from refref_jax import configuration
 from refref_jax.data import image_files, scene_folder
 from refref_jax.data.scene_folder import Frames
+from refref_jax.geometry import cameras as cameras_module
 from refref_jax.optics.media import Scene
 from refref_jax.render import backdrop, pixels
 from refref_jax.render.backdrop import Pyramid
 from refref_jax.render.checkpoint_io import SavedModel
-from refref_jax.render.model import Params, init_params, path_detail, surface_of
+from refref_jax.render.model import LayersInHull, Params, init_params, path_detail, surface_of
+from refref_jax.sampling.scene_bounds import HULL_CELLS
 from refref_jax.training import backdrop_equations, backdrop_solver, run_folder
 from refref_jax.training.backdrop_equations import Block, Gains
 from refref_jax.training.config import TrainConfig, require
@@ -214,7 +216,8 @@ def _read(
 
     frames = scene_folder.read_frames(folder, "train")
     images, among = scene_folder.read_images(frames), None
-    if config.scene.pixels == "background":
+    ball = model.config.backdrop.field_ball if model.config.backdrop else None
+    if config.scene.pixels == "background" or ball is not None:
         among = image_files.well_outside(scene_folder.read_masks(frames))
         if not among.any():
             raise ValueError(
@@ -294,6 +297,8 @@ def behind_field(
 ) -> TrainState:
     """Solves for the backdrop behind a field, from the pixels that see nothing but the backdrop.
 
+    If the field is sampled in a ball, the cells of its grid that all masks show are marked, too.
+
     Args:
       run: folder of the run.
       state: state before the first step of the field.
@@ -316,4 +321,22 @@ def behind_field(
             raise KeyboardInterrupt  # there is no new state to save
         field = params.field._replace(backdrop=reached.pyramid)
         params = params._replace(field=field, tints=reached.tints)
+    if isinstance(params.field, LayersInHull):
+        hull = jax.device_put(_hull(model, problem.frames))
+        params = params._replace(field=params.field._replace(hull=hull))
     return state._replace(params=params)
+
+
+def _hull(model: SavedModel, frames: Frames) -> Float[np.ndarray, "cells cells cells"]:
+    """Returns which cells of the grid around the ball of a field all masks show, as 1 or 0.
+
+    Masks are grown by a pixel, so that no thin part is lost between the centres of cells.
+    """
+    assert model.config.backdrop is not None and model.config.backdrop.field_ball is not None
+    *centre, radius = model.config.backdrop.field_ball
+    middles = (np.arange(HULL_CELLS) + 0.5) / HULL_CELLS * 2.0 - 1.0
+    points = radius * np.stack(np.meshgrid(*3 * [middles], indexing="ij"), axis=-1) + centre
+    frames, masks = scene_folder.read_object_views(frames)
+    grown = ~image_files.well_outside(masks, margin=1)
+    within = cameras_module.visual_hull(points.reshape(-1, 3), grown, frames.cameras)
+    return within.reshape(points.shape[:3]).astype(np.float32)

@@ -36,7 +36,9 @@ FIELD_ONLY = (
 )
 """Options that only a radiance field reads."""
 
-BACKDROP_ONLY = ("backdrop_resolution", "iterations", "most_pixels", "view_dependence")
+BACKDROP_ONLY = (
+    *("backdrop_resolution", "iterations", "most_pixels", "view_dependence", "field_ball"),
+)
 """Options that only a backdrop reads."""
 
 BACKDROP_PIXELS = 64_000_000
@@ -48,7 +50,7 @@ _FAR_FIELD = (
     *("interior", "tints", *FIELD_ONLY, *BACKDROP_ONLY),
 )
 
-# Options that determine near and far planes, which earlier runs lack, and numbers of samples.
+# Options that determine near and far planes, and numbers of samples.
 _BOUNDS = ("scene", "properties", "background", "radius", "contraction")
 _SAMPLES = (*_BOUNDS, *_OBJECTS, "centre", "paths", "max_bends", "interior", "far_field", *_KIND)
 
@@ -175,8 +177,7 @@ class FieldConfig:
       log2_hashmap_size: Hash map size of the radiance field, base-2 logarithm of a level's entries.
       max_res: Finest resolution of the radiance field's hash grid, cells per side.
       precision: Arithmetic precision of the fields.
-      dilation: Dilation of a proposal before it is sampled, as a share of its mean bin width; 0 for
-        none.
+      dilation: Dilation of a proposal before it is sampled, in units of its mean bin width, or 0.
       colour_network: Layers of the colour network: plain, or with a skip connection (skip), which
         appends its inputs to the outputs of its first layer, as in the paper's released code.
       brightest: Largest linear radiance of the field; above 1 (white) where lamps or windows shine.
@@ -198,6 +199,8 @@ class FieldConfig:
         image and channel (per_image), for captures. Test images are rendered with a gain of 1.
       view_dependence: Dependence of a backdrop's radiance on the direction of light: none, or
         linear, for walls that shine.
+      field_ball: Ball x,y,z,radius, world units, in which the field before a backdrop is sampled
+        where all masks show the object; by default it is only sampled inside the meshes.
     """
 
     preset: choices.PresetName = option("tiny")
@@ -231,6 +234,7 @@ class FieldConfig:
     most_pixels: int | None = option(None, after=("far_field",))
     exposure: choices.Exposure | None = option(None, after=("far_field",))
     view_dependence: choices.ViewDependence | None = option(None, after=("far_field",))
+    field_ball: choices.BallOption | None = option(None, after=(*_OBJECTS, "interior"))
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
@@ -242,10 +246,7 @@ class FieldConfig:
                 "positive numbers. Use a list such as samples_per_ray=32,20."
             )
         if self.multisamples not in (None, *_PATTERNS):
-            raise ValueError(
-                f"There is no pattern with multisamples={self.multisamples}. Give 1 (on the centre "
-                "line) or 6 (Zip-NeRF's hexagon)."
-            )
+            raise ValueError(f"multisamples={self.multisamples} is no pattern. Give 1 or 6.")
         ranges = dict.fromkeys(("most_pixels", "gaussians"), (1, _MOST)) | {"brightest": (1, 8)}
         ranges |= {"backdrop_resolution": (4, _CELLS), "iterations": (1, _FINEST)}
         ranges |= {"sub_spaces": (1, _MOST_SUB_SPACES), "max_res": (1, _FINEST)}
@@ -258,8 +259,8 @@ class FieldConfig:
                 raise ValueError(f"{name} is {number}. Give 0 or a positive number.")
         if self.log2_hashmap_size not in (None, *range(1, _MOST_ENTRIES + 1)):
             raise ValueError(
-                f"log2_hashmap_size is {self.log2_hashmap_size}, but it is the base-2 logarithm of "
-                f"a table's size. Give 1 to {_MOST_ENTRIES}, such as 17 for 131,072 entries."
+                f"log2_hashmap_size is {self.log2_hashmap_size}. Give 1 to {_MOST_ENTRIES}, such "
+                "as 17 for tables of 131,072 entries."
             )
 
 
@@ -338,7 +339,7 @@ class ScheduleConfig:
         """Checks the numbers."""
         configuration.convert_fields(self)
         for name in ("steps", "warmup", "anneal", "batch", "pretraced_batches"):
-            number, least = getattr(self, name), 0 if name in ("warmup", "anneal") else 1
+            number, least = getattr(self, name), int(name not in ("warmup", "anneal"))
             if number is not None and not least <= number <= _MOST:
                 raise ValueError(f"{name} is {number}. Give {least} to {_MOST}.")
         for name, rate in (("learning_rate", self.peak), ("final_learning_rate", self.end)):

@@ -383,11 +383,12 @@ def read_pixels(config: TrainConfig, scene: Path, *, objects: Scene | None = Non
       objects: objects that the rays of the pixels have to meet; all pixels by default.
     """
     frames = scene_folder.read_frames(scene, "train")
-    kept = None
-    if config.scene.pixels == "background":
+    kept, ball = None, config.model.field_ball
+    if config.scene.pixels == "background" or ball:
         kept = image_files.well_outside(scene_folder.read_masks(frames))
     if objects is not None:
-        kept = backdrop_equations.meets(objects, frames.cameras)
+        met = backdrop_equations.meets(objects, frames.cameras)
+        kept = met if not ball or kept is None else met | ~kept
     images, batch = scene_folder.read_images(frames), require(config.schedule.batch)
     return PixelSampler(images, frames.cameras, seed=config.seed, batch=batch, kept=kept)
 

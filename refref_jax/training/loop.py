@@ -37,7 +37,6 @@ from refref_jax.render.model import (
     has_foreground,
     init_params,
     path_detail,
-    surface_of,
 )
 from refref_jax.training import devices, learned_surface, objective
 from refref_jax.training.config import ScheduleConfig, TrainConfig, require
@@ -108,8 +107,8 @@ def _surface_labels(params: Params) -> Params:
 def _labels(params: Params) -> Params:
     """Returns which parameters are learned in front of a backdrop, and which are fixed."""
     learned = jax.tree.map(lambda leaf: "learned", params)
-    fixed = jax.tree.map(lambda leaf: "fixed", surface_of(params))
-    return learned._replace(field=learned.field._replace(backdrop=fixed))
+    fixed = jax.tree.map(lambda leaf: "fixed", params.field)
+    return learned._replace(field=fixed._replace(field=learned.field.field))
 
 
 def learning_rate(schedule: ScheduleConfig) -> optax.Schedule:

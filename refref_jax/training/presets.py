@@ -170,7 +170,14 @@ def override_model(
     if asked.far_field == "backdrop":
         cells = asked.backdrop_resolution or BACKDROP_RESOLUTION
         seen = asked.view_dependence or "none"
-        given["backdrop"] = BackdropConfig(cells, in_front=in_front, view_dependence=seen)
+        given["backdrop"] = BackdropConfig(
+            cells, in_front=in_front, view_dependence=seen, field_ball=asked.field_ball
+        )
+        if asked.field_ball and (in_front, model.interior) != ("field", "field"):
+            raise ValueError(
+                "field_ball is where a field is sampled, but this model has none around its "
+                "objects. Add interior=field, or leave it out."
+            )
     model = dataclasses.replace(model, **{n: x for n, x in given.items() if x is not None})
     if asked.precision is not None:
         proposals = tuple(

@@ -354,12 +354,11 @@ def _resolve_far_field(
             exposure="fixed",
             view_dependence="none",
         )
+    if "field_ball" not in config.overrides():
+        config = config.decided(field_ball=None)
     for name in BACKDROP_ONLY:
         if (value := config.get(name)) is not None:
-            raise ValueError(
-                f"{name}={value} has no effect with far_field=field. Leave it out, or use "
-                "far_field=backdrop."
-            )
+            raise ValueError(f"{name}={value} has no effect with far_field=field. Leave it out.")
     return config
 
 
@@ -417,7 +416,8 @@ def _share_of_misfits(config: TrainConfig, facts: SceneFacts) -> float:
     if facts.misfits is None:
         return 0.0
     exposure = config.model.exposure or "fixed"
-    share = facts.misfits(space=space, size=size, centre=centre, exposure=exposure)
+    where = {"masked": True} if config.model.field_ball else {}  # a field explains what masks show
+    share = facts.misfits(space=space, size=size, centre=centre, exposure=exposure, **where)
     return share if share > scene_analysis.MOST_MISFITS else 0.0
 
 

@@ -12,13 +12,18 @@ from refref_jax.fields import registry
 from refref_jax.fields.base import Radiance
 from refref_jax.optics.light_paths import Stop
 from refref_jax.render import backdrop, pixels
-from refref_jax.render.model import BackdropConfig, Layers, Params, init_params
+from refref_jax.render.model import BackdropConfig, Layers, LayersInHull, Params, init_params
 from tests.factories import made_paths
 from tests.factories.small_model import MODEL
 
 _SURFACE = BackdropConfig(8, in_front="field")
 _INSIDE = dataclasses.replace(MODEL, backdrop=_SURFACE)
 _CLEAR = dataclasses.replace(MODEL, backdrop=_SURFACE, interior="clear")
+# A ball of which masks show the half above z = 0.
+_IN_BALL = dataclasses.replace(
+    MODEL, backdrop=dataclasses.replace(_SURFACE, field_ball=(0.0, 0.0, 0.0, 2.0))
+)
+_HULLS = {_IN_BALL: jnp.zeros((2, 2, 2)).at[:, :, 1].set(1.0)}
 _GREY = 0.7
 _ONE = jnp.float32(1.0)
 
@@ -35,10 +40,13 @@ def _straight():
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _planted(config, path, fog):
+def _planted(config, path, fog, hull):
     """Renders one path through the field of `plant`, without which it is not called."""
     paths = jax.tree.map(lambda x: x[None], path)
-    params = Params((fog,), Layers(fog, backdrop.init(8, radiance=_GREY)))
+    layers = Layers(fog, backdrop.init(8, radiance=_GREY))
+    if config.backdrop.field_ball is not None:
+        layers = LayersInHull(*layers, hull)
+    params = Params((fog,), layers)
     jitter = pixels.no_jitter(config, 1)
     seen = pixels.render_paths(params, config, paths, jitter, anneal=_ONE)
     return jax.tree.map(lambda x: x[0], seen)
@@ -56,7 +64,7 @@ def plant(monkeypatch):
 
     monkeypatch.setattr(registry, "density", density)
     monkeypatch.setattr(registry, "radiance", radiance)
-    return lambda config, path, fog: _planted(config, path, jnp.float32(fog))
+    return lambda config, path, fog: _planted(config, path, jnp.float32(fog), _HULLS.get(config))
 
 
 @pytest.mark.parametrize("fog", [0.0, 1e-6, 0.8, 30.0, 1e6])
@@ -82,6 +90,29 @@ def test_paths_beside_the_objects_see_nothing_but_the_backdrop(plant, fog):
     np.testing.assert_allclose(seen.histograms[-1].weights, 0.0)
 
 
+@pytest.mark.parametrize("fog", [0.0, 0.8, 30.0, 1e6])
+def test_a_field_in_a_ball_dims_light_beside_the_objects(plant, monkeypatch, fog):
+    monkeypatch.setitem(_HULLS, _IN_BALL, jnp.ones((2, 2, 2)))
+    seen = plant(_IN_BALL, _straight(), fog).composite
+    passed = np.exp(-fog * 4.0 / MODEL.radius)
+    expected = passed * _GREY + (1.0 - passed) * np.array([0.0, 0.0, -1.0])
+    np.testing.assert_allclose(seen.rgb, expected, atol=2e-5)
+    if fog == 1e6:
+        np.testing.assert_allclose(seen.median, 1.0, atol=0.1)
+
+
+def test_a_field_in_a_ball_is_empty_where_masks_show_nothing_but_inside_objects(plant):
+    def depth(path):
+        seen = plant(_IN_BALL, path, 0.8)
+        return -np.log(seen.composite.rgb[0] / _GREY) * MODEL.radius / 0.8
+
+    interval = 4.0 / MODEL.samples
+    np.testing.assert_allclose(depth(_straight()), 2.0, atol=interval)  # from z = 2 to z = 0
+    ways = [(0, 0, -1)] * 3
+    inside = made_paths.path([3.0, 2.0], ways, [0, 1, 0], origin=(0, 0, 3))
+    np.testing.assert_allclose(depth(inside), 4.0, rtol=1e-4)  # and on to z = -2
+
+
 def test_a_path_that_ends_on_an_opaque_surface_sees_the_field_there(plant):
     inside = made_paths.path([2.0], [(0, 0, -1), (0, 0.6, -0.8)], [0, 1], origin=(0, 0, 3))
     stopped = inside._replace(stop=Stop(jnp.float32(2.75), None))
@@ -103,21 +134,23 @@ def test_opaque_surfaces_in_front_of_an_environment_have_finite_distances(plant)
 
 
 @pytest.mark.slow
-def test_only_the_field_in_front_of_the_backdrop_has_gradients():
+@pytest.mark.parametrize("config", [_INSIDE, _IN_BALL], ids=["inside", "in a ball"])
+def test_only_the_field_in_front_of_the_backdrop_has_gradients(config):
     paths = jax.tree.map(lambda x: jnp.asarray(x)[None], _bent())
-    params = jax.jit(lambda: init_params(jax.random.key(0), _INSIDE))()
-    jitter = pixels.no_jitter(_INSIDE, 1)
+    params = jax.jit(lambda: init_params(jax.random.key(0), config))()
+    jitter = pixels.no_jitter(config, 1)
 
     @jax.jit
     @jax.grad
     def slope(params):
-        light = pixels.gather_light(params, _INSIDE, paths, jitter, rays=1, anneal=_ONE)
+        light = pixels.gather_light(params, config, paths, jitter, rays=1, anneal=_ONE)
         return jnp.sum(light.linear)
 
     slopes = slope(params)
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(slopes))
     assert any(np.any(leaf != 0.0) for leaf in jax.tree.leaves(slopes.field.field))
-    assert not any(np.any(leaf != 0.0) for leaf in jax.tree.leaves(slopes.field.backdrop))
+    fixed = slopes.field[1:]
+    assert not any(np.any(leaf != 0.0) for leaf in jax.tree.leaves(fixed))
 
 
 @pytest.mark.slow

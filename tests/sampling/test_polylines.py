@@ -51,6 +51,62 @@ def _walk(path, t, *, skip_inside=False):
     return [np.array(column) for column in zip(*steps, strict=True)]
 
 
+# --- within a ball ---
+
+_BALL = (2.0, 1.5, 0.0, 1.9)
+_in_ball = jax.jit(polylines.path_in_ball, static_argnums=1)
+
+
+def test_a_path_in_a_ball_by_hand():
+    line = _in_ball(_elbow(), _BALL)
+    half = np.sqrt(1.9**2 - 1.5**2)  # of the chords of the first and the last segment
+    np.testing.assert_allclose(line.stop, 2.0 * half + 3.0, atol=_DISTANCE)
+    seen = _at(line, [0.0, half + 1.0, line.stop])
+    expected = [[2.0 - half, 0.0, 0.0], [2.0, 1.0, 0.0], [2.0, 3.0, half]]
+    np.testing.assert_allclose(seen.position, expected, atol=_DISTANCE)
+    np.testing.assert_allclose(seen.arc, [2.0 - half, 3.0, 5.0 + half], atol=_DISTANCE)
+    np.testing.assert_array_equal(seen.outside, [True, False, True])
+
+
+@pytest.mark.parametrize("bends", [0, 1, 2, 5])
+def test_points_in_a_ball_are_those_of_the_whole_path(bends):
+    path = made_paths.random_path(bends, bends=bends, segments=_SEGMENTS)
+    corners = np.asarray(path.points[: bends + 1])
+    centre = np.mean(corners, axis=0)
+    reach = np.max(np.linalg.norm(corners - centre, axis=-1))
+    ball = (*map(float, centre), float(reach) + 0.5)
+    line = _in_ball(path, ball)
+    seen = _at(line, np.linspace(0.0, line.stop, 60))
+    whole = _at(_whole(path), seen.arc)
+    np.testing.assert_allclose(seen.position, whole.position, atol=4.0 * _DISTANCE)
+    away = np.linalg.norm(np.asarray(seen.position) - centre, axis=-1)
+    assert np.all(away < ball[3] + 1e-4) and line.stop > 0.0
+    np.testing.assert_allclose(away[-1], ball[3], atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("path", "ball", "length"),
+    [
+        (made_paths.path([], [[1, 0, 0]], [0], segments=3), (2.0, 1.5, 0.0, 1.4), 0.0),
+        (made_paths.path([], [[1, 0, 0]], [0], segments=3), (-5.0, 0.0, 0.0, 1.0), 0.0),
+        (made_paths.path([], [[1, 0, 0]], [0], segments=3), (1.0, 0.0, 0.0, 3.0), 4.0),
+        (made_paths.path([], [[1, 0, 0]], [0], segments=3), (2.0, 1.5, 0.0, 1.5), 0.0),
+        (made_paths.path([1.0], [[1, 0, 0], [0, 1, 0]], [0, 1]), (9.0, 0.0, 0.0, 1.0), 0.0),
+    ],
+    ids=["beside", "behind", "around the camera", "tangent", "bends before it, and misses it"],
+)
+def test_lengths_in_a_ball_at_the_extremes(path, ball, length):
+    line = _in_ball(jax.tree.map(jnp.asarray, path), ball)
+    np.testing.assert_allclose(line.stop, length, atol=1e-5)
+    assert np.all(np.isfinite(_at(line, [0.0, length]).position))
+
+
+def test_a_path_in_a_ball_ends_on_an_opaque_surface():
+    path = _elbow()._replace(stop=light_paths.Stop(jnp.float32(5.5), None))
+    line = _in_ball(path, _BALL)
+    np.testing.assert_allclose(line.stop, np.sqrt(1.9**2 - 1.5**2) + 3.0 + 0.5, atol=_DISTANCE)
+
+
 # --- the whole path ---
 
 

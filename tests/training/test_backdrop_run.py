@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from refref_jax.data import scene_folder
+from refref_jax.data import image_files, meshes, scene_folder
 from refref_jax.geometry.cameras import image_rays
 from refref_jax.render import Model, pixels, render_image, render_rays
 from refref_jax.render.model import look_up
-from refref_jax.training import backdrop_fit, backdrop_solver, run_folder
+from refref_jax.training import backdrop_equations, backdrop_fit, backdrop_solver, run_folder
 from refref_jax.training.config import TrainConfig
-from refref_jax.training.fit import Periods, fit, prepare
+from refref_jax.training.fit import Periods, fit, prepare, read_pixels
 from tests.factories.cut_ball import cut_ball
 from tests.factories.small_model import CAMERAS
 
@@ -249,6 +249,35 @@ def test_a_field_on_opaque_parts_is_trained_in_front_of_the_backdrop(filled, tmp
     resumed = fit(None, **again, existing="resume")
     pairs = zip(jax.tree.leaves(resumed.params), jax.tree.leaves(model.params), strict=True)
     assert all(np.array_equal(ours, theirs) for ours, theirs in pairs)
+
+
+@pytest.mark.slow
+def test_a_field_around_a_mesh_that_is_too_small_is_where_masks_show_the_object(scene, tmp_path):
+    frames = scene_folder.read_frames(scene, "train")
+    (whole,) = meshes.read_meshes(scene)
+    radius = float(np.max(np.linalg.norm(whole.vertices, axis=-1)))
+    ball = (0.0, 0.0, 0.0, 1.5 * radius)
+    options = {"backdrop_resolution": 64, "iterations": _ROUND, "field_ball": ball}
+    config = TrainConfig().override(scene=str(scene), interior="field", **options)
+    config = config.override(far_field="backdrop", steps=6, batch=64, pretraced_batches=2)
+    small = whole._replace(vertices=0.5 * whole.vertices)
+    model = fit(config, out=tmp_path / "run", parts=[small], report=lambda line: None)
+    hull = np.asarray(model.params.field.hull)
+    middles = np.linspace(-1.0, 1.0, 2 * len(hull) + 1)[1::2] * ball[3]
+    away = np.linalg.norm(np.stack(np.meshgrid(*3 * [middles], indexing="ij")), axis=0)
+    # Three views leave more than the ball, but none of it is lost.
+    assert np.all(hull[away < radius] == 1.0) and np.mean(hull) < 0.5
+    drawn = read_pixels(run_folder.read_config(tmp_path / "run"), scene, objects=model.scene)
+    masks = scene_folder.read_masks(frames)
+    assert (
+        drawn.batches * 64
+        >= masks.sum()
+        > 2 * backdrop_equations.meets(model.scene, frames.cameras).sum()
+    )
+    seen = render_image(model, image_rays(frames.cameras, 0))
+    beside = image_files.well_outside(masks)[0]
+    error = (np.asarray(seen.rgb) - scene_folder.read_images(frames)[0] / 255.0)[beside]
+    assert -10.0 * np.log10(np.mean(error**2)) > 19.0
 
 
 @pytest.mark.slow

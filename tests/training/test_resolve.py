@@ -121,12 +121,30 @@ def test_a_backdrop_has_a_size_and_a_number_of_iterations():
     assert (again.config, again.model) == (made.config, made.model)
 
 
+_AROUND = {"far_field": "backdrop", "interior": "field"}
+
+
+def test_a_field_in_a_ball_is_in_front_of_a_backdrop():
+    ball = (0.0, 0.0, 1.0, 2.0)
+    made = _resolve(_CLEAR, **_AROUND, field_ball=ball)
+    assert made.model.config.backdrop.field_ball == ball
+    again = resolve(made.config, SceneFacts(_CLEAR, CAMERAS, (), None, None, ()))
+    assert (again.config, again.model) == (made.config, made.model)
+    decided = TrainConfig().override(far_field="field").decided(interior="field", field_ball=ball)
+    without = resolve(decided, SceneFacts(_CLEAR, CAMERAS, (), None, None, ()))
+    assert without.config.model.field_ball is None and without.model.config.backdrop is None
+
+
 @pytest.mark.parametrize(
     ("found", "given", "message"),
     [
         ("clear", {"far_field": "field", "backdrop_resolution": 64}, "=64 has no effect"),
         ("clear", {"far_field": "field", "iterations": 8}, "iterations=8 has no effect"),
         ("clear", {"interior": "field", "iterations": 8}, "iterations=8 has no effect"),
+        ("clear", {"far_field": "field", "field_ball": (0, 0, 0, 2)}, "has no effect"),
+        ("clear", {"far_field": "backdrop", "field_ball": (0, 0, 0, 2)}, "Add interior=field"),
+        ("clear", {**_AROUND, "field_ball": (0, 0, 0, 0)}, "centre and a positive radius"),
+        ("clear", {**_AROUND, "field_ball": (0, 0, math.nan, 1)}, "field_ball is"),
         ("clear", {"far_field": "backdrop", "contraction": "always"}, "contraction=always"),
         ("clear", {"far_field": "backdrop", "paths": "straight"}, "straight rays"),
         ("clear", {"far_field": "backdrop", "backdrop_resolution": 3}, "backdrop_resolution is 3"),
@@ -530,7 +548,7 @@ def test_a_far_plane_behind_a_background_is_refused(space):
 def test_a_plane_that_is_no_distance_is_refused(name, distance):
     with pytest.raises(ValueError, match=f"{name} is {distance}. Give 0 or a positive"):
         FieldConfig(**{name: distance})
-    with pytest.raises(ValueError, match="such that 0 <= near < far"):
+    with pytest.raises(ValueError, match="Give 0 <= near < far"):
         _resolve(_CLEAR, contraction="always", near=150.0)
 
 
