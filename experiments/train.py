@@ -134,7 +134,7 @@ def _with_object(run: Path, asked: TrainConfig) -> tuple[TrainConfig, list[MeshP
     parts = training_body.find(run, config, ior=ior, resume=_RESUME.value)
     if parts is not None:
         made = training_body.folder(run, config.scene.reconstruction)
-        config = training_body.with_parts(config, parts, made, ior=ior, say=print)
+        config = training_body.with_parts(config, parts, made, run=run, ior=ior, say=print)
     return config, parts
 
 

@@ -217,6 +217,7 @@ def with_parts(
     parts: Sequence[MeshPart],
     made: Path,
     *,
+    run: Path,
     ior: Sequence[str],
     say: config_flags.Say,
 ) -> TrainConfig:
@@ -229,6 +230,7 @@ def with_parts(
       config: configuration, with the folder of the scene.
       parts: parts of the reconstructed object.
       made: folder of its reconstruction.
+      run: folder of the run.
       ior: values of --ior.
       say: function called with the decisions that are made again.
     """
@@ -241,8 +243,9 @@ def with_parts(
         config = config_flags.on_top(config, {"reconstruction": folder}, say=say)
     free = config.model.interior is None and not _EXCLUDE_FIELD & config.overrides()
     if free and (why := _unexplained(made)):
-        say(why)
-        config = config.decided(interior="field", field_ball=_ball(config))
+        ball = _ball(config, made, run, say)
+        say(f"{why}; field_ball={','.join(map(str, ball))}" if ball else why)
+        config = config.decided(interior="field", field_ball=ball)
     is_given = given_index(ior) is not None
     return config.override(ior=index) if is_given else config.decided(ior=index)
 
@@ -255,25 +258,36 @@ def _unexplained(made: Path) -> str:
     if light is None or light.after is None or not light.leaves_error:
         return ""
     return (
-        f"interior=field: the shape leaves an error of {light.after:.4f}, of which a field learns a "
-        "part, in the object and where masks show it; --interior=absorbing leaves it out and is "
-        "faster"
+        f"interior=field: the shape leaves an error of {light.after:.4f}; a field learns a part of "
+        "it; --interior=absorbing leaves it out and is faster"
     )
 
 
-def _ball(config: TrainConfig) -> choices.BallOption | None:
+def _ball(
+    config: TrainConfig, made: Path, run: Path, say: config_flags.Say
+) -> choices.BallOption | None:
     """Returns a ball around all that the training masks show, if the far field may be a backdrop.
 
-    The reconstructed object may lack thin and opaque parts, which a field around it learns.
+    The reconstructed object may lack thin and opaque parts, which a field around it learns. A run
+    that has begun keeps its ball. Where masks are known to be wrong, there is none.
     """
-    from experiments.r3f import geometry_stage
+    from experiments.r3f import geometry_stage, records
+    from refref_jax.reconstruct import ReconstructionError
+    from refref_jax.training import run_folder
 
     if config.model.far_field == "field":
         return None
-    box = geometry_stage.box_of_masks(Path(config.scene.path))
-    x, y, z = 0.5 * (box.low + box.high)
-    radius = 0.5 * sum((box.high - box.low) ** 2) ** 0.5
-    return tuple(round(float(number), 4) for number in (x, y, z, radius))
+    if (run / _CONFIG).is_file():
+        return run_folder.read_config(run).model.field_ball
+    if records.read(made).config.outliers:
+        return None
+    try:
+        box = geometry_stage.box_of_masks(Path(config.scene.path))
+    except ReconstructionError as error:
+        say(f"warning: the field is sampled inside the object only, as the masks disagree: {error}")
+        return None
+    x, y, z = (round(float(number), 4) for number in 0.5 * (box.low + box.high))
+    return x, y, z, round(0.5 * float(sum((box.high - box.low) ** 2)) ** 0.5, 4)
 
 
 def note(run: Path, parts: Sequence[MeshPart] | None, given: str) -> None:

@@ -5,10 +5,11 @@ Pixel `(row, column)` has its centre at `(column + 0.5, row + 0.5)`, rows counte
 """
 
 import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Real
+from jaxtyping import Float, Int, Real
 
 from refref_jax.choices import ORIGIN, Position
 from refref_jax.geometry.rays import Rays
@@ -80,6 +81,13 @@ def image_rays(cameras: Cameras, camera: int) -> Rays:
     return pixel_rays(cameras, np.full(row.shape, camera), row, column)
 
 
+def bands(cameras: Cameras, view: int, *, rows: int) -> Iterator[Rays]:
+    """Yields the rays of an image, `[rows, width]`, some rows of pixels at a time."""
+    for start in range(0, cameras.height, rows):
+        row, column = np.indices((min(rows, cameras.height - start), cameras.width))
+        yield pixel_rays(cameras, np.full(row.shape, view), start + row, column)
+
+
 class Projection(NamedTuple):
     """Points projected into the image of a camera.
 
@@ -100,31 +108,6 @@ def project(
     scale = np.divide(-cameras.focal, z, out=np.zeros_like(z), where=z < 0.0)
     middle = 0.5 * np.array([cameras.width, cameras.height])
     return Projection(middle + np.stack([scale * x, -scale * y], axis=-1), -z)
-
-
-def visual_hull(
-    points: Float[np.ndarray, "points 3"], masks: Bool[np.ndarray, "cameras h w"], cameras: Cameras
-) -> Bool[np.ndarray, " points"]:
-    """Returns which points all masks show as part of the object.
-
-    A view says nothing about points outside of its image or behind its camera.
-
-    Args:
-      points: points in world units.
-      masks: masks of the object, one per camera.
-      cameras: cameras of the masks.
-
-    Source: Laurentini, The Visual Hull Concept for Silhouette-Based Image Understanding (1994).
-    """
-    within = np.ones(len(points), bool)
-    for mask, pose in zip(masks, cameras.poses, strict=True):
-        left = np.flatnonzero(within)
-        seen = project(points[left], pose, cameras)
-        column, row = np.floor(seen.pixels).astype(np.int64).T
-        told = (seen.depths > 0.0) & (row >= 0) & (row < cameras.height)
-        told &= (column >= 0) & (column < cameras.width)
-        within[left[told]] = mask[row[told], column[told]]
-    return within
 
 
 def projection_slopes(

@@ -13,7 +13,7 @@ Colours are averaged as linear light and encoded afterwards, as a camera does.
 """
 
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -39,9 +39,9 @@ from refref_jax.render.backdrop import Mips
 from refref_jax.render.model import Model, ModelConfig, Params, is_backdrop, path_detail, surface_of
 from refref_jax.render.model import Rendering as Rendering
 from refref_jax.render.pixels import ALL, BRANCHES, BackdropEnds, TilePaths
+from refref_jax.sampling import scene_bounds
 
-# Padding rays of a tile start at this distance and point away from the scene: they hit nothing and
-# leave the capacity of the path buffers to the other rays.
+# Padding rays start this far away and point away: they hit nothing, and need no path buffers.
 _OUT_OF_REACH = 1e9
 
 _SMALLEST_TILE = 1024  # smaller ones would have too little capacity for the paths of a ray
@@ -69,6 +69,7 @@ backdrop_ends = jit_quickly(
 )
 mipmap = jit_quickly(backdrop.mipmap, static_argnames="space")
 _finish = jit_quickly(pixels.finish)
+_meets_cells = jit_quickly(jax.vmap(scene_bounds.meets_cells, in_axes=(None, None, 0)))
 
 RAYS_OF_A_BAND = 1 << 18
 """Maximum number of rays held at once, unless one row of pixels has more."""
@@ -207,13 +208,20 @@ def render_image(
     nothing = jax.device_get(pixels.blank(jax.device_put(np.zeros((0, 3), np.float32))))
     if is_backdrop(model.config) and branch == "both":
         return _render_backdrop(model, rays, nothing)
-    return in_tiles(
+    render = functools.partial(
+        in_tiles,
         lambda tile, _, real: _render_tile(model, tile, real, chunk, branch),
-        rays,
         tile=tile_for(max(rays.radii.size, TILE)),
         nothing=nothing,
         instead=_INSTEAD,
     )
+    if model.config.backdrop is None or branch != "both":
+        return render(rays)
+    # A field in front of a backdrop is inside objects, or in cells that masks show.
+    hull, ball = getattr(model.params.field, "hull", None), model.config.backdrop.field_ball
+    met, hits, misses = split_by_hit(model.scene.surfaces, rays, cells=ball and (hull, ball))
+    seen = render(hits), _render_backdrop(model, misses, nothing)
+    return jax.tree.map(functools.partial(merged, met), *seen)
 
 
 def _render_backdrop(model: Model, rays: Rays, nothing: Rendering) -> Rendering:
@@ -249,12 +257,24 @@ def _render_backdrop(model: Model, rays: Rays, nothing: Rendering) -> Rendering:
 
 
 def split_by_hit(
-    surfaces: Surfaces | LevelSet, rays: Rays, *, tile: int | None = None, instead: str = _INSTEAD
+    surfaces: Surfaces | LevelSet,
+    rays: Rays,
+    *,
+    tile: int | None = None,
+    cells: Any = None,
+    instead: str = _INSTEAD,
 ) -> tuple[Bool[np.ndarray, "*rays"], Rays, Rays]:
-    """Returns which rays meet an object, these rays and the others; `merged` joins their values."""
+    """Returns which rays meet an object, these rays and the others; `merged` joins their values.
+
+    If `cells` are a grid and its ball, rays that meet cells of it (`meets_cells`) count, too.
+    """
     refuse_tracers(surfaces, instead=instead)
     rays = fetch(rays, instead=instead)
     met = np.isfinite(find_first_surface(surfaces, rays, tile=tile).distances)
+    if cells:
+        grid, ball = jax.device_put((cells[0], np.float32(cells[1])))
+        options: Any = {"tile": TILE, "nothing": np.zeros(0, bool), "instead": instead}
+        met |= in_tiles(lambda some, *_: _meets_cells(grid, ball, some), rays, **options)
     return met, _select(rays, met), _select(rays, ~met)
 
 
@@ -372,7 +392,7 @@ def render_camera(
         return average(pixels.render_splats(model, fine, view, side=side), side)
     bands = [
         average(render_image(model, rays, chunk=chunk), side)
-        for rays in _bands(fine, view, rows=side * max(1, band // (side * fine.width)))
+        for rays in pinholes.bands(fine, view, rows=side * max(1, band // (side * fine.width)))
     ]
     return join(bands)
 
@@ -380,7 +400,7 @@ def render_camera(
 def warm_up(model: Model, cameras: Cameras, *, rays_per_pixel: int, chunk: int | None) -> None:
     """Compiles all programs of `render_camera`, so that later timings are of rendering alone."""
     on_cpu = runs_on_cpu() and model.config.splats is None
-    if on_cpu and not is_backdrop(model.config):  # one tile size serves all images
+    if on_cpu and model.config.backdrop is None:  # one tile size serves all images
         render_image(model, pixel_rays(cameras, *np.zeros((3, 1), np.int64)), chunk=chunk)
     else:
         render_camera(model, cameras, 0, rays_per_pixel=rays_per_pixel, chunk=chunk)
@@ -405,13 +425,6 @@ def average(fine: Rendering, side: int) -> Rendering:
         linear=linear,
         dropped=filtered(fine.dropped),
     )
-
-
-def _bands(cameras: Cameras, view: int, *, rows: int) -> Iterator[Rays]:
-    """Yields the rays of an image, some rows at a time."""
-    for start in range(0, cameras.height, rows):
-        row, column = np.indices((min(rows, cameras.height - start), cameras.width))
-        yield pixel_rays(cameras, np.full(row.shape, view), start + row, column)
 
 
 class FirstSurface(NamedTuple):

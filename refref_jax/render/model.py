@@ -71,9 +71,9 @@ class BackdropConfig:
       in_front: model of what is in front of the surface: a `field` on opaque parts, and inside
         parts that need one, or `nothing`.
       view_dependence: dependence of radiance on the direction of light: `linear`, or `none`.
-      field_ball: centre and radius of a ball, world units, in which a field in front of the surface
-        is sampled wherever all masks show the object, inside and outside of its meshes; only inside
-        of them if `None`.
+      field_ball: centre and radius of a ball, world units, in which the field in front of the
+        surface is sampled where all masks show the object; only inside its meshes if `None`.
+      hull_cells: number of cells per side of the grid that tells what masks show.
     """
 
     resolution: int
@@ -81,6 +81,7 @@ class BackdropConfig:
     in_front: InFront = "nothing"
     view_dependence: ViewDependence = "none"
     field_ball: BallOption | None = None
+    hull_cells: int = 96
 
     @property
     def axes(self) -> int:
@@ -186,7 +187,7 @@ class ModelConfig:
         if not all(map(math.isfinite, self.centre)):
             raise ValueError(f"centre is {self.centre}. Give three finite numbers of world units.")
         if self.learned_tints < 0:
-            raise ValueError(f"learned_tints is {self.learned_tints}. Give a number of parts.")
+            raise ValueError(f"learned_tints is {self.learned_tints}. Give a number of parts or 0.")
         kinds = {"space": Space, "interior": Interior, "footprint": Footprint}
         for name, kind in (kinds | {"last_sample": LastSample}).items():
             _check_choice(name, getattr(self, name), get_args(kind))
@@ -231,13 +232,13 @@ class Layers(NamedTuple):
     backdrop: Pyramid
 
 
-class LayersInHull(NamedTuple):
+class LayersWithHull(NamedTuple):
     """Layers with a field in a ball; a type of its own, as checkpoints of `Layers` have no hull.
 
     Attributes:
       field: as in `Layers`.
       backdrop: as in `Layers`.
-      hull: 1 in the cells around `field_ball` that all masks show as part of the object, else 0.
+      hull: occupancy of the cells of the cube around `field_ball`: 1 in the masks' hull, else 0.
     """
 
     field: base.Params
@@ -320,7 +321,7 @@ def init_params(key: Array, config: ModelConfig) -> Params:
     if shape is not None and surface is not None:
         field = Layers(field, surface)
         if shape.field_ball is not None:
-            field = LayersInHull(*field, jnp.zeros(3 * (scene_bounds.HULL_CELLS,)))
+            field = LayersWithHull(*field, jnp.zeros(3 * (shape.hull_cells,)))
     gains = jnp.zeros((config.learned_gains, 3)) if config.learned_gains else None
     return Params(proposals, field, colours, gains)
 
@@ -338,12 +339,12 @@ def is_backdrop(config: ModelConfig) -> bool:
 def surface_of(params: Params) -> Pyramid:
     """Returns the radiance of a backdrop."""
     field = params.field
-    return field.backdrop if isinstance(field, Layers | LayersInHull) else field
+    return field.backdrop if isinstance(field, Layers | LayersWithHull) else field
 
 
 def field_of(params: Params) -> base.Params:
     """Returns the parameters of the radiance field."""
-    return params.field.field if isinstance(params.field, Layers | LayersInHull) else params.field
+    return params.field.field if isinstance(params.field, Layers | LayersWithHull) else params.field
 
 
 class FieldPoint(NamedTuple):
@@ -383,8 +384,7 @@ def look_up(
     for other, use in ((config.splats, "field=zipnerf"), (config.backdrop, "far_field=field")):
         if other is not None:
             raise ValueError(
-                "This model has splats or a backdrop in place of a field, so there is no density "
-                f"to look up. Train it with {use}."
+                f"With splats or a backdrop, there is no density to look up. Train it with {use}."
             )
     if registry.has_sub_spaces(config.field):
         raise ValueError(

@@ -247,7 +247,7 @@ def foreground_radiance(
         assert not isinstance(seen, Surface)  # `resolve` refuses a backdrop behind a surface
         sampled, points = line.stop > 0.0, samples.points
         if config.backdrop is not None and (ball := config.backdrop.field_ball):
-            shown = scene_bounds.values_in_ball(params.field.hull, ball, points.position) > 0.5
+            shown = scene_bounds.values_around_ball(params.field.hull, ball, points.position) > 0.5
             sampled &= shown | ~points.outside
 
         def weigh(density: Array) -> Array:

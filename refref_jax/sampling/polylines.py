@@ -127,9 +127,9 @@ def inside_path(path: LightPaths, *, parts: tuple[int, ...] | None = None) -> Po
 
 
 def path_in_ball(path: LightPaths, ball: BallOption) -> Polyline:
-    """Returns one light path whose coordinate only advances within a ball around the objects.
+    """Returns one light path whose coordinate advances from a ball's surface to its surface.
 
-    It begins where the path enters the ball and advances along all segments between bends. Its stop
+    Its first and last segment are cut by the ball, and those between bends are kept whole. Its stop
     is where the path leaves the ball or ends on an opaque surface; 0 for a path beside the ball.
 
     Args:
@@ -145,8 +145,8 @@ def path_in_ball(path: LightPaths, ball: BallOption) -> Polyline:
     if line.stop is not None:
         leave = jnp.minimum(leave, line.stop - line.arcs)
     ends = jnp.where(slots == last, leave, path.ends - line.arcs)
-    enter = jnp.maximum(middle - half, 0.0)
-    starts = jnp.where(slots == 0, jnp.minimum(enter, ends), 0.0)
+    ends = jnp.where(slots == 0, jnp.minimum(ends, leave), ends)
+    starts = jnp.where(slots == 0, jnp.clip(middle - half, 0.0, ends), 0.0)
     lengths = jnp.where(used, jnp.maximum(ends - starts, 0.0), 0.0)
     points, turns = line.differentials
     moved = line._replace(

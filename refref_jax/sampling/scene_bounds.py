@@ -20,12 +20,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from refref_jax import numerics
 from refref_jax.choices import ORIGIN, BallOption, Position, Space
 from refref_jax.geometry.cameras import Cameras
-from refref_jax.geometry.rays import chord
+from refref_jax.geometry.rays import Rays, chord
 from refref_jax.sampling.polylines import Gaussians, Polyline
 
 _LAMBDA = -1.5
@@ -39,9 +39,6 @@ costs 2.7 dB.
 
 SHORTEST = 1e-3
 """Minimum length of a path, in units of the scene radius: `s` keeps four digits in float32."""
-
-HULL_CELLS = 96
-"""Cells per side of the grid that tells where in its ball a field is sampled."""
 
 _NEAR = 0.05
 _FAR_UNBOUNDED = 1000.0
@@ -266,8 +263,10 @@ def _ladder(
     return (1.0 + t / _scale(warp)) ** _LAMBDA
 
 
-def values_in_ball(
-    grid: Float[Array, "cells cells cells"], ball: BallOption, points: Float[Array, "points 3"]
+def values_around_ball(
+    grid: Float[Array, "cells cells cells"],
+    ball: BallOption | Float[Array, "4"],
+    points: Float[Array, "points 3"],
 ) -> Float[Array, " points"]:
     """Returns the values of the cells of points, on a grid of the cube around a ball.
 
@@ -276,9 +275,24 @@ def values_in_ball(
       ball: centre and radius of the ball, world units.
       points: points in world units; those outside the cube have the value 0.
     """
-    *centre, radius = ball
-    half = 0.5 * grid.shape[0]
-    offset = (points - jnp.asarray([centre], points.dtype)) / radius
+    around, half = jnp.asarray(ball, points.dtype), 0.5 * grid.shape[0]
+    offset = (points - around[None, :3]) / around[3]
     cells = jnp.floor(half * (offset + 1.0)).astype(jnp.int32)
     held = jnp.clip(cells, 0, grid.shape[0] - 1)
     return jnp.where(jnp.all(cells == held, axis=-1), grid[tuple(held.T)], 0.0)
+
+
+def meets_cells(
+    grid: Float[Array, "cells cells cells"], ball: Float[Array, "4"], ray: Rays
+) -> Bool[Array, ""]:
+    """Returns whether a straight ray meets a cell that is not 0, at steps of a quarter of a cell.
+
+    Args:
+      grid: values of the cells.
+      ball: centre and radius of the ball, world units.
+      ray: the ray.
+    """
+    middle, half = chord(ball[3], ray.origins - ball[:3], ray.directions)
+    along = middle + half * jnp.linspace(-1.0, 1.0, 4 * grid.shape[0])
+    points = ray.origins[None] + jnp.maximum(along, 0.0)[:, None] * ray.directions[None]
+    return (half > 0.0) & jnp.any(values_around_ball(grid, ball, points) > 0.0)

@@ -10,7 +10,7 @@ meet no object are straight and are not traced. A fraction of the pixels is held
 import functools
 import itertools
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -170,12 +170,12 @@ def warm_up(levels: Pyramid, space: Space) -> None:
     jax.block_until_ready(_mipmap_transposed(images.mipmap(levels, space), space))
 
 
-def meets(scene: Scene, cameras: Cameras) -> Bool[np.ndarray, "views h w"]:
-    """Returns which pixels' camera rays meet an object."""
+def meets(scene: Scene, cameras: Cameras, *, cells: Any = None) -> Bool[np.ndarray, "views h w"]:
+    """Returns which pixels' camera rays meet an object, or cells (`images.split_by_hit`)."""
     views, found = len(cameras.poses), []
     for view in range(views):
         rays, _ = cameras_module.rays_of_views(cameras, np.array([view]), 1)
-        found.append(np.isfinite(images.find_first_surface(scene.surfaces, rays).distances))
+        found.append(images.split_by_hit(scene.surfaces, rays, cells=cells)[0])
     return np.stack(found).reshape(views, cameras.height, cameras.width)
 
 

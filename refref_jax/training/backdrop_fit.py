@@ -16,17 +16,18 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jaxtyping import Bool, Float, UInt8
+from scipy.ndimage import distance_transform_edt
 
 from refref_jax import configuration
+from refref_jax.choices import BallOption
 from refref_jax.data import image_files, scene_folder
 from refref_jax.data.scene_folder import Frames
-from refref_jax.geometry import cameras as cameras_module
+from refref_jax.geometry import cameras as pinholes
 from refref_jax.optics.media import Scene
 from refref_jax.render import backdrop, pixels
 from refref_jax.render.backdrop import Pyramid
 from refref_jax.render.checkpoint_io import SavedModel
-from refref_jax.render.model import LayersInHull, Params, init_params, path_detail, surface_of
-from refref_jax.sampling.scene_bounds import HULL_CELLS
+from refref_jax.render.model import ModelConfig, Params, init_params, path_detail, surface_of
 from refref_jax.training import backdrop_equations, backdrop_solver, run_folder
 from refref_jax.training.backdrop_equations import Block, Gains
 from refref_jax.training.config import TrainConfig, require
@@ -71,6 +72,7 @@ class _Problem(NamedTuple):
       images: training images, 8-bit sRGB.
       among: mask of the pixels that are fitted; `None` if all are.
       traced: function that is called for each view that is traced, and may interrupt.
+      cells: occupancy of the cells around the ball of a field, and the ball; `None` without one.
     """
 
     config: TrainConfig
@@ -80,6 +82,7 @@ class _Problem(NamedTuple):
     images: UInt8[np.ndarray, "views h w 3"]
     among: Bool[np.ndarray, "views h w"] | None
     traced: Callable[[int, int], None]
+    cells: Any
 
     @property
     def share(self) -> float:
@@ -216,15 +219,17 @@ def _read(
 
     frames = scene_folder.read_frames(folder, "train")
     images, among = scene_folder.read_images(frames), None
-    ball = model.config.backdrop.field_ball if model.config.backdrop else None
-    if config.scene.pixels == "background" or ball is not None:
+    cells = _cells(model.config, frames)
+    if config.scene.pixels == "background":
         among = image_files.well_outside(scene_folder.read_masks(frames))
-        if not among.any():
-            raise ValueError(
-                f"No pixel of the train views of {folder} lies outside the masks, so nothing shows "
-                "the background. Use images with room around the object, or check the masks."
-            )
-    return _Problem(config, model, scene, frames, images, among, traced)
+    if cells is not None:
+        among = ~backdrop_equations.meets(scene, frames.cameras, cells=cells)
+    if among is not None and not among.any():
+        raise ValueError(
+            f"No pixel of the train views of {folder} lies outside the masks, so nothing shows "
+            "the background. Use images with room around the object, or check the masks."
+        )
+    return _Problem(config, model, scene, frames, images, among, traced, cells)
 
 
 def solve(
@@ -321,22 +326,56 @@ def behind_field(
             raise KeyboardInterrupt  # there is no new state to save
         field = params.field._replace(backdrop=reached.pyramid)
         params = params._replace(field=field, tints=reached.tints)
-    if isinstance(params.field, LayersInHull):
-        hull = jax.device_put(_hull(model, problem.frames))
+    if problem.cells is not None:
+        hull = jax.device_put(problem.cells[0])
         params = params._replace(field=params.field._replace(hull=hull))
     return state._replace(params=params)
 
 
-def _hull(model: SavedModel, frames: Frames) -> Float[np.ndarray, "cells cells cells"]:
-    """Returns which cells of the grid around the ball of a field all masks show, as 1 or 0.
+def pixels_in_front(
+    config: ModelConfig, scene: Scene, folder: Path
+) -> Bool[np.ndarray, "views h w"]:
+    """Returns which training pixels see more than a backdrop: an object, or a field in a ball.
 
-    Masks are grown by a pixel, so that no thin part is lost between the centres of cells.
+    Raises:
+      ValueError: if there is a ball, but no masks, or they show nothing in it.
     """
-    assert model.config.backdrop is not None and model.config.backdrop.field_ball is not None
-    *centre, radius = model.config.backdrop.field_ball
-    middles = (np.arange(HULL_CELLS) + 0.5) / HULL_CELLS * 2.0 - 1.0
-    points = radius * np.stack(np.meshgrid(*3 * [middles], indexing="ij"), axis=-1) + centre
+    frames = scene_folder.read_frames(folder, "train")
+    return backdrop_equations.meets(scene, frames.cameras, cells=_cells(config, frames))
+
+
+def _cells(
+    config: ModelConfig, frames: Frames
+) -> tuple[Float[np.ndarray, "cells cells cells"], BallOption] | None:
+    """Returns the grid around the ball of a field, if there is one, and the ball.
+
+    The grid is 1 in the hull of the masks, and 0 elsewhere. A cell is in the hull if all masks that
+    can see it show the object within its footprint or next to it, and at least one can.
+
+    Source: Laurentini, The Visual Hull Concept for Silhouette-Based Image Understanding (1994).
+    """
+    shape = config.backdrop
+    if shape is None or shape.field_ball is None:
+        return None
     frames, masks = scene_folder.read_object_views(frames)
-    grown = ~image_files.well_outside(masks, margin=1)
-    within = cameras_module.visual_hull(points.reshape(-1, 3), grown, frames.cameras)
-    return within.reshape(points.shape[:3]).astype(np.float32)
+    *centre, radius = shape.field_ball
+    count, cameras = shape.hull_cells, frames.cameras
+    middles = radius * ((2.0 * np.arange(count) + 1.0) / count - 1.0)
+    points = np.stack(np.meshgrid(*3 * [middles], indexing="ij"), axis=-1).reshape(-1, 3) + centre
+    reach = math.sqrt(3.0) * radius / count  # half the diagonal of a cell
+    within, seen = np.ones(len(points), bool), np.zeros(len(points), bool)
+    for mask, pose in zip(masks, cameras.poses, strict=True):
+        away, left = distance_transform_edt(~mask), np.flatnonzero(within)
+        places, depths = pinholes.project(points[left], pose, cameras)
+        column, row = np.floor(places).astype(np.int64).T
+        told = (depths > 0.0) & (row >= 0) & (row < len(mask))
+        told &= (column >= 0) & (column < mask.shape[1])
+        seen[left[told]] = True
+        footprint = reach * cameras.focal / depths[told]
+        within[left[told]] = away[row[told], column[told]] <= 1.0 + footprint
+    if not np.any(within & seen):
+        raise ValueError(
+            f"The masks show nothing in field_ball={shape.field_ball}. Check its position, and the "
+            "masks, of which a single wrong one suffices."
+        )
+    return (within & seen).reshape(3 * (count,)).astype(np.float32), shape.field_ball

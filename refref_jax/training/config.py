@@ -199,7 +199,7 @@ class FieldConfig:
         image and channel (per_image), for captures. Test images are rendered with a gain of 1.
       view_dependence: Dependence of a backdrop's radiance on the direction of light: none, or
         linear, for walls that shine.
-      field_ball: Ball x,y,z,radius, world units, in which the field before a backdrop is sampled
+      field_ball: Ball x,y,z,radius, world units, in which the field of interior=field is sampled
         where all masks show the object; by default it is only sampled inside the meshes.
     """
 
@@ -339,7 +339,7 @@ class ScheduleConfig:
         """Checks the numbers."""
         configuration.convert_fields(self)
         for name in ("steps", "warmup", "anneal", "batch", "pretraced_batches"):
-            number, least = getattr(self, name), int(name not in ("warmup", "anneal"))
+            number, least = getattr(self, name), 0 if name in ("warmup", "anneal") else 1
             if number is not None and not least <= number <= _MOST:
                 raise ValueError(f"{name} is {number}. Give {least} to {_MOST}.")
         for name, rate in (("learning_rate", self.peak), ("final_learning_rate", self.end)):

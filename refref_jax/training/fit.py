@@ -19,7 +19,9 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import jax
+import numpy as np
 from jax.sharding import Mesh
+from jaxtyping import Bool
 
 from refref_jax import atomic_files, compilation, configuration
 from refref_jax.compilation import at_once
@@ -31,7 +33,6 @@ from refref_jax.render import checkpoint_io
 from refref_jax.render.checkpoint_io import SavedModel
 from refref_jax.render.model import Model, ModelConfig, Params, has_foreground
 from refref_jax.training import (
-    backdrop_equations,
     backdrop_fit,
     devices,
     learned_surface,
@@ -310,7 +311,8 @@ def _train_field(
 ) -> int:
     """Trains a field, and returns the number of the last step."""
     surface = model.config.backdrop is not None
-    sampler = read_pixels(config, folder, objects=objects if surface else None)
+    kept = backdrop_fit.pixels_in_front(model.config, objects, folder) if surface else None
+    sampler = read_pixels(config, folder, kept=kept)
     set_up = functools.partial(loop.set_up, config, model.config, model.settings, objects, sampler)
     begin = functools.partial(init_state, config.seed, model.config, config.schedule)
     tasks = functools.partial(set_up, mesh=mesh, beside=loop.compile_steps), begin
@@ -374,21 +376,19 @@ def _report_misses(setup: loop.Setup, report: Callable[[str], None]) -> None:
         )
 
 
-def read_pixels(config: TrainConfig, scene: Path, *, objects: Scene | None = None) -> PixelSampler:
+def read_pixels(
+    config: TrainConfig, scene: Path, *, kept: Bool[np.ndarray, "views h w"] | None = None
+) -> PixelSampler:
     """Reads the training pixels of a resolved configuration.
 
     Args:
       config: configuration of the run.
       scene: folder of the scene.
-      objects: objects that the rays of the pixels have to meet; all pixels by default.
+      kept: mask of the pixels to draw from; all pixels by default.
     """
     frames = scene_folder.read_frames(scene, "train")
-    kept, ball = None, config.model.field_ball
-    if config.scene.pixels == "background" or ball:
+    if config.scene.pixels == "background" and kept is None:
         kept = image_files.well_outside(scene_folder.read_masks(frames))
-    if objects is not None:
-        met = backdrop_equations.meets(objects, frames.cameras)
-        kept = met if not ball or kept is None else met | ~kept
     images, batch = scene_folder.read_images(frames), require(config.schedule.batch)
     return PixelSampler(images, frames.cameras, seed=config.seed, batch=batch, kept=kept)
 

@@ -175,8 +175,8 @@ def override_model(
         )
         if asked.field_ball and (in_front, model.interior) != ("field", "field"):
             raise ValueError(
-                "field_ball is where a field is sampled, but this model has none around its "
-                "objects. Add interior=field, or leave it out."
+                "field_ball is where the field of interior=field is sampled. Add that, or leave "
+                "field_ball out."
             )
     model = dataclasses.replace(model, **{n: x for n, x in given.items() if x is not None})
     if asked.precision is not None:

@@ -74,8 +74,8 @@ class SceneFacts(NamedTuple):
       source: reason for `half_extent` and `centre`.
       centre: centre of the background, in scene.json, given or measured.
       stated: source of the kind of the background, such as `scene.json`; empty without one.
-      misfits: function of space, size, centre and exposure to `scene_analysis.misfits` of the
-        scene's images.
+      misfits: function of space, size, centre, exposure and `masked` to `scene_analysis.misfits` of
+        the scene's images.
     """
 
     analysis: SceneAnalysis
@@ -358,7 +358,7 @@ def _resolve_far_field(
         config = config.decided(field_ball=None)
     for name in BACKDROP_ONLY:
         if (value := config.get(name)) is not None:
-            raise ValueError(f"{name}={value} has no effect with far_field=field. Leave it out.")
+            raise ValueError(f"{name}={value} has no effect without far_field=backdrop.")
     return config
 
 

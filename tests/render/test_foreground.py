@@ -7,14 +7,27 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import trimesh
 
+import refref_jax
 from refref_jax.fields import registry
 from refref_jax.fields.base import Radiance
+from refref_jax.geometry.cameras import image_rays
+from refref_jax.geometry.rays import Rays
 from refref_jax.optics.light_paths import Stop
-from refref_jax.render import backdrop, pixels
-from refref_jax.render.model import BackdropConfig, Layers, LayersInHull, Params, init_params
+from refref_jax.optics.path_settings import PATH_PRESETS
+from refref_jax.render import Model, backdrop, pixels, render_image, render_rays
+from refref_jax.render.model import (
+    BackdropConfig,
+    Layers,
+    LayersWithHull,
+    Params,
+    init_params,
+    surface_of,
+)
+from refref_jax.sampling import scene_bounds
 from tests.factories import made_paths
-from tests.factories.small_model import MODEL
+from tests.factories.small_model import CAMERAS, MODEL, initial
 
 _SURFACE = BackdropConfig(8, in_front="field")
 _INSIDE = dataclasses.replace(MODEL, backdrop=_SURFACE)
@@ -45,7 +58,7 @@ def _planted(config, path, fog, hull):
     paths = jax.tree.map(lambda x: x[None], path)
     layers = Layers(fog, backdrop.init(8, radiance=_GREY))
     if config.backdrop.field_ball is not None:
-        layers = LayersInHull(*layers, hull)
+        layers = LayersWithHull(*layers, hull)
     params = Params((fog,), layers)
     jitter = pixels.no_jitter(config, 1)
     seen = pixels.render_paths(params, config, paths, jitter, anneal=_ONE)
@@ -160,3 +173,39 @@ def test_only_given_parts_are_sampled(plant):
     expected = passed * _GREY + (1.0 - passed) * np.array([0.0, 0.6, -0.8])
     np.testing.assert_allclose(plant(first, _bent(), 0.8).composite.rgb, expected, atol=2e-5)
     np.testing.assert_allclose(plant(second, _bent(), 0.8).composite.rgb, _GREY, atol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("config", [_INSIDE, _IN_BALL], ids=["inside", "in a ball"])
+def test_rays_that_meet_no_field_are_left_to_the_backdrop(config):
+    glass = refref_jax.single_object(trimesh.creation.icosphere(subdivisions=2), index=1.5)
+    params = initial(config)
+    if config is _IN_BALL:
+        params = params._replace(field=params.field._replace(hull=_HULLS[config]))
+    walls = jnp.linspace(0.1, 0.9, surface_of(params)[0].size).reshape(surface_of(params)[0].shape)
+    field = params.field._replace(backdrop=(walls, *surface_of(params)[1:]))
+    model = Model(config, PATH_PRESETS["tree"], glass, params._replace(field=field))
+    rays = image_rays(CAMERAS, 0)
+    seen = render_image(model, rays)
+    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rays)
+    expected = jax.jit(render_rays)(model, flat)
+    for ours, theirs in zip(seen, expected, strict=True):
+        np.testing.assert_allclose(ours.reshape(theirs.shape), theirs, atol=2e-5)
+
+
+@pytest.mark.parametrize(
+    ("origin", "direction", "meets"),
+    [
+        ((0, 0, 5), (0, 0, -1), True),
+        ((0, 0, 5), (0, 0, 1), False),
+        ((0, 0, -1), (0, 0, -1), False),
+        ((0, 0, -1), (0, 0, 1), True),
+        ((1, 0, 1), (1, 0, 0), True),
+        ((5, 0, -1), (-1, 0, 0), False),
+        ((5, 3, 1), (-1, 0, 0), False),
+    ],
+)
+def test_rays_meet_cells_in_front_of_them(origin, direction, meets):
+    ray = Rays(*(jnp.asarray(x, jnp.float32) for x in (origin, direction)), jnp.float32(1e-3))
+    ball = jnp.asarray(_IN_BALL.backdrop.field_ball)
+    assert bool(scene_bounds.meets_cells(_HULLS[_IN_BALL], ball, ray)) is meets

@@ -419,5 +419,5 @@ def test_the_origin_as_centre_costs_no_operation(space):
 def test_values_in_a_ball_by_hand():
     grid = jnp.arange(8.0).reshape(2, 2, 2)
     points = [[1.5, 2.5, 3.5], [0.5, 1.5, 2.5], [0.5, 2.5, 2.5], [3.5, 2.0, 3.0], [-9.0, 2.0, 3.0]]
-    values = scene_bounds.values_in_ball(grid, (1.0, 2.0, 3.0, 1.0), jnp.asarray(points))
+    values = scene_bounds.values_around_ball(grid, (1.0, 2.0, 3.0, 1.0), jnp.asarray(points))
     np.testing.assert_array_equal(values, [7.0, 0.0, 2.0, 0.0, 0.0])

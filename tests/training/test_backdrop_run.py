@@ -1,5 +1,6 @@
 """Runs with a backdrop: solved, paused and continued, rendered, and refused where none fits."""
 
+import dataclasses
 import json
 import shutil
 
@@ -11,14 +12,14 @@ import pytest
 import trimesh
 
 from refref_jax.data import image_files, meshes, scene_folder
-from refref_jax.geometry.cameras import image_rays
+from refref_jax.geometry.cameras import image_rays, orbit, project
 from refref_jax.render import Model, pixels, render_image, render_rays
-from refref_jax.render.model import look_up
+from refref_jax.render.model import BackdropConfig, look_up
 from refref_jax.training import backdrop_equations, backdrop_fit, backdrop_solver, run_folder
 from refref_jax.training.config import TrainConfig
-from refref_jax.training.fit import Periods, fit, prepare, read_pixels
+from refref_jax.training.fit import Periods, fit, prepare
 from tests.factories.cut_ball import cut_ball
-from tests.factories.small_model import CAMERAS
+from tests.factories.small_model import CAMERAS, MODEL
 
 pytestmark = [pytest.mark.loose, pytest.mark.longest]
 
@@ -267,17 +268,38 @@ def test_a_field_around_a_mesh_that_is_too_small_is_where_masks_show_the_object(
     away = np.linalg.norm(np.stack(np.meshgrid(*3 * [middles], indexing="ij")), axis=0)
     # Three views leave more than the ball, but none of it is lost.
     assert np.all(hull[away < radius] == 1.0) and np.mean(hull) < 0.5
-    drawn = read_pixels(run_folder.read_config(tmp_path / "run"), scene, objects=model.scene)
     masks = scene_folder.read_masks(frames)
-    assert (
-        drawn.batches * 64
-        >= masks.sum()
-        > 2 * backdrop_equations.meets(model.scene, frames.cameras).sum()
-    )
+    assert np.all(backdrop_fit.pixels_in_front(model.config, model.scene, scene)[masks])
+    assert masks.sum() > 2 * backdrop_equations.meets(model.scene, frames.cameras).sum()
     seen = render_image(model, image_rays(frames.cameras, 0))
     beside = image_files.well_outside(masks)[0]
     error = (np.asarray(seen.rgb) - scene_folder.read_images(frames)[0] / 255.0)[beside]
     assert -10.0 * np.log10(np.mean(error**2)) > 19.0
+
+
+@pytest.mark.parametrize("size", [100, 400])
+def test_a_rod_thinner_than_a_cell_is_in_the_hull(tmp_path, size):
+    cameras, ball = orbit(12, distance=4.0, elevation=0.4, size=size, angle_x=0.9), (0, 0, 0, 1.8)
+    rod = np.stack([np.zeros(201), np.zeros(201), np.linspace(-0.7, 0.7, 201)], axis=-1)
+    for view, pose in enumerate(cameras.poses):
+        column, row = np.floor(project(rod, pose, cameras).pixels).astype(np.int64).T
+        mask = np.zeros((size, size), bool)
+        mask[row, column] = True
+        image_files.write_mask(tmp_path / f"{view}.png", mask)
+    masks = tuple(tmp_path / f"{view}.png" for view in range(12))
+    frames = scene_folder.Frames(tuple("abcdefghijkl"), masks, masks, None, cameras)
+    shape = BackdropConfig(8, in_front="field", field_ball=ball)
+    config = dataclasses.replace(MODEL, backdrop=shape)
+    grid, _ = backdrop_fit._cells(config, frames)
+    cells = np.floor((rod / 1.8 + 1.0) * 0.5 * len(grid)).astype(np.int64)
+    assert np.all(grid[tuple(cells.T)] == 1.0) and np.mean(grid) < 2e-3
+    far = dataclasses.replace(shape, field_ball=(9.0, 0.0, 0.0, 1.0))
+    with pytest.raises(ValueError, match=r"show nothing in field_ball=\(9"):
+        backdrop_fit._cells(dataclasses.replace(MODEL, backdrop=far), frames)
+    # Nothing is claimed of what no camera sees.
+    wide = dataclasses.replace(shape, field_ball=(0.0, 0.0, 0.0, 5.0))
+    grid, _ = backdrop_fit._cells(dataclasses.replace(MODEL, backdrop=wide), frames)
+    assert np.mean(grid) < 2e-3
 
 
 @pytest.mark.slow

@@ -50,7 +50,9 @@ def test_outlines_place_an_object_before_a_field(tmp_path, monkeypatch):
     assert found.inputs == chain.fingerprint(scene)
     config = TrainConfig().override(reconstruction=str(out))
     read = chain.read_parts(out)
-    config = training_body.with_parts(config, read, out, ior=(), say=lambda line: None)
+    config = training_body.with_parts(
+        config, read, out, run=out / "run", ior=(), say=lambda line: None
+    )
     assert config.model.interior is None  # nothing says that the shape is wrong
 
 

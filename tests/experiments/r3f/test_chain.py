@@ -27,7 +27,7 @@ from experiments.r3f import (
 from experiments.r3f.records import ReconstructionConfig
 from refref_jax.data import meshes, scene_folder
 from refref_jax.geometry.triangle_meshes import corner_normals, make_mesh
-from refref_jax.reconstruct import opaque_parts, refinement
+from refref_jax.reconstruct import ReconstructionError, opaque_parts, refinement
 from refref_jax.reconstruct.bubbles import Bubble, ObjectWithBubbles
 from refref_jax.reconstruct.contents import COARSE, Interior
 from refref_jax.reconstruct.free_vessels import FreeVessel
@@ -40,6 +40,7 @@ from refref_jax.reconstruct.refinement import Refinement
 from refref_jax.reconstruct.refractive_index import Descent, IndexEstimate
 from refref_jax.reconstruct.shape_from_refraction import SingleObject
 from refref_jax.reconstruct.shapes import FixedShape, mesh_of
+from refref_jax.training import config_files
 from refref_jax.training.config import TrainConfig
 from tests.factories import bodies, scenes, vessels
 from tests.factories.silhouettes import RADIUS, without_masks, write_scene
@@ -535,21 +536,55 @@ def test_an_object_that_no_model_explains_is_told(after, doubted):
         (0.07, {"interior": "clear"}, "clear"),
         (0.07, {"tints": "learned"}, None),
         (0.07, {"exposure": "per_image"}, None),
+        (0.07, {"far_field": "field"}, "field"),
         (None, {}, None),
     ],
 )
-def test_a_field_inside_learns_what_a_shape_leaves_unexplained(
-    whole, tmp_path, after, given, interior
+def test_a_field_learns_what_a_shape_leaves_unexplained_where_masks_show_it(
+    scene, whole, tmp_path, after, given, interior
 ):
     made, said = tmp_path / "made", []
     shutil.copytree(whole, made)
     light = records.LightFacts(kept=True, index=1.5, before=0.11, after=after)
     records.write(made, dataclasses.replace(records.read(made), light=light))
-    config = TrainConfig().override(reconstruction=str(made), **given)
-    parts = [scenes.ball(1.0, subdivisions=1)]
-    config = training_body.with_parts(config, parts, made, ior=(), say=said.append)
+    asked = TrainConfig().override(scene=str(scene), reconstruction=str(made), **given)
+    parts, run = [scenes.ball(1.0, subdivisions=1)], tmp_path / "run"
+    config = training_body.with_parts(asked, parts, made, run=run, ior=(), say=said.append)
     assert config.model.interior == interior
     assert any("error of 0.0700" in line for line in said) == (interior == "field")
+    ball = config.model.field_ball
+    assert (ball is not None) == (interior == "field" and "far_field" not in given)
+    if ball is not None:
+        assert np.linalg.norm(ball[:3]) + 1.0 < ball[3] < 3.0  # the object is a ball of radius 1
+        assert any("field_ball=" in line for line in said)
+
+
+def test_wrong_masks_and_earlier_runs_have_no_field_around_the_object(
+    scene, whole, tmp_path, monkeypatch
+):
+    made, said = tmp_path / "made", []
+    shutil.copytree(whole, made)
+    light = records.LightFacts(kept=True, index=1.5, before=0.11, after=0.07)
+    records.write(made, dataclasses.replace(records.read(made), light=light))
+    asked = TrainConfig().override(scene=str(scene), reconstruction=str(made))
+    options = {"ior": (), "say": said.append}
+    parts = [scenes.ball(1.0, subdivisions=1)]
+
+    def ball(run):
+        config = training_body.with_parts(asked, parts, made, run=tmp_path / run, **options)
+        assert config.model.interior == "field"
+        return config.model.field_ball
+
+    (tmp_path / "begun").mkdir()
+    config_files.write(tmp_path / "begun" / "config.json", asked.decided(interior="field"))
+    assert ball("begun") is None
+
+    def fail(scene):
+        raise ReconstructionError("Nothing is left after carving.")
+
+    monkeypatch.setattr(geometry_stage, "box_of_masks", fail)
+    assert ball("new") is None
+    assert any("masks disagree: Nothing is left" in line for line in said)
 
 
 @pytest.mark.slow
