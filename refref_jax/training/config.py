@@ -246,7 +246,7 @@ class FieldConfig:
                 "positive numbers. Use a list such as samples_per_ray=32,20."
             )
         if self.multisamples not in (None, *_PATTERNS):
-            raise ValueError(f"multisamples={self.multisamples} is no pattern. Give 1 or 6.")
+            raise ValueError(f"multisamples={self.multisamples}. Give 1 (on the centre line) or 6.")
         ranges = dict.fromkeys(("most_pixels", "gaussians"), (1, _MOST)) | {"brightest": (1, 8)}
         ranges |= {"backdrop_resolution": (4, _CELLS), "iterations": (1, _FINEST)}
         ranges |= {"sub_spaces": (1, _MOST_SUB_SPACES), "max_res": (1, _FINEST)}

@@ -279,7 +279,10 @@ def test_a_field_around_a_mesh_that_is_too_small_is_where_masks_show_the_object(
 
 @pytest.mark.parametrize("size", [100, 400])
 def test_a_rod_thinner_than_a_cell_is_in_the_hull(tmp_path, size):
-    cameras, ball = orbit(12, distance=4.0, elevation=0.4, size=size, angle_x=0.9), (0, 0, 0, 1.8)
+    cameras, ball = (
+        orbit(12, distance=4.0, elevation=0.4, size=size, angle_x=0.9),
+        (0.0, 0.0, 0.0, 1.8),
+    )
     rod = np.stack([np.zeros(201), np.zeros(201), np.linspace(-0.7, 0.7, 201)], axis=-1)
     for view, pose in enumerate(cameras.poses):
         column, row = np.floor(project(rod, pose, cameras).pixels).astype(np.int64).T

@@ -144,7 +144,7 @@ def test_a_field_in_a_ball_is_in_front_of_a_backdrop():
         ("clear", {"far_field": "field", "field_ball": (0, 0, 0, 2)}, "has no effect"),
         ("clear", {"far_field": "backdrop", "field_ball": (0, 0, 0, 2)}, "Add interior=field"),
         ("clear", {**_AROUND, "field_ball": (0, 0, 0, 0)}, "centre and a positive radius"),
-        ("clear", {**_AROUND, "field_ball": (0, 0, math.nan, 1)}, "field_ball is"),
+        ("clear", {**_AROUND, "field_ball": (0, 0, math.nan, 1)}, r"field_ball\[2\] is NaN"),
         ("clear", {"far_field": "backdrop", "contraction": "always"}, "contraction=always"),
         ("clear", {"far_field": "backdrop", "paths": "straight"}, "straight rays"),
         ("clear", {"far_field": "backdrop", "backdrop_resolution": 3}, "backdrop_resolution is 3"),
