@@ -3,11 +3,11 @@
     python -m benchmarks.r3f_untuned --scenes=FOLDER,FOLDER [--limit=N]
 
 Each scene is reconstructed from its images and masks as `experiments.reconstruct` does. One model
-is trained with the reconstruction in front of a backdrop, with a field inside if the shape leaves
-an error, and another one along straight rays; fields, also those of opaque parts, have the preset
-`tiny` and `--steps` steps. The table has the error of the validation pixels (root mean square of
-the channels of a pixel, at most 0.15, sRGB; its mean over the pixels), the masked PSNR of test
-views, and the gain. Finished reconstructions and trainings are reused.
+is trained with the reconstruction in front of a backdrop, with a field where masks show the object
+if the shape leaves an error, and another one along straight rays; fields, also those of opaque
+parts, have the preset `tiny` and `--steps` steps. The table has the error of the validation pixels
+(root mean square of the channels of a pixel, at most 0.15, sRGB; its mean over the pixels), the
+masked PSNR of test views, and the gain. Finished reconstructions and trainings are reused.
 
 Asserted is the mean gain over all scenes that are given. docs/shape_from_light_results.md lists
 scenes that led to no change of the code, and the command that renders them.

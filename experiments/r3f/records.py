@@ -196,7 +196,7 @@ class LightFacts:
 
     @property
     def leaves_error(self) -> bool:
-        """Whether the shape leaves an error that a field inside the object reduces."""
+        """Whether the shape leaves an error that a field reduces."""
         return self.after is not None and self.after > UNEXPLAINED
 
     @property

@@ -223,7 +223,7 @@ def with_parts(
 ) -> TrainConfig:
     """Returns a configuration that uses a reconstructed object.
 
-    If its reconstruction leaves an error, a field inside the object learns what its shape does not
+    If its reconstruction leaves an error, a field in and around it learns what its shape does not
     explain, unless an interior is given, or an option that excludes a field there.
 
     Args:

@@ -389,10 +389,11 @@ def _choose_far_field(
     config: TrainConfig, facts: SceneFacts, needs: Sequence[str]
 ) -> tuple[choices.FarField, str]:
     """Returns the model of the far field, and the reason for it."""
-    asked = config.model.interior == "field" and "interior" in config.overrides()
-    if needs or (asked and config.paths.max_bends):
+    inside = config.model.interior == "field" and config.paths.max_bends
+    if needs or (inside and "interior" in config.overrides()):
         return "field", f"the scene needs a field: {[*needs, *_in_front(config, facts)][0]}"
-    given = [name for name in (*BACKDROP_ONLY, *FIELD_ONLY) if name in config.overrides()]
+    read = BACKDROP_ONLY if inside else (*BACKDROP_ONLY, *FIELD_ONLY)
+    given = [name for name in read if name in config.overrides()]
     if given:
         choice: choices.FarField = "backdrop" if given[0] in BACKDROP_ONLY else "field"
         return choice, f"{given[0]} is an option of a {choice}"
@@ -461,8 +462,7 @@ def _resolve_training(
     blurs, rounds = len(require(config.losses.blurs)), len(model.proposals)
     if blurs != rounds:
         raise ValueError(
-            f"There are {blurs} blurs for {rounds} proposal levels. Give one for each, or leave "
-            "them out."
+            f"There are {blurs} blurs for {rounds} proposal levels. Give one for each."
         )
     preset = presets.PRESETS[config.model.preset]
     steps = config.schedule.steps or preset.schedule.steps

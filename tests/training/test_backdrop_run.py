@@ -80,6 +80,8 @@ def test_a_field_inside_that_is_a_decision_keeps_the_backdrop(scene):
     decided, _ = prepare(asked.decided(interior="field"), report=lambda line: None)
     assert decided.config.model.far_field == "backdrop"
     assert decided.model.config.interior == "field" and "preset=tiny" in decided.describe()
+    fewer = asked.override(steps=100).decided(interior="field")  # of the field in front of it
+    assert prepare(fewer, report=lambda line: None)[0].config.model.far_field == "backdrop"
     given, _ = prepare(asked.override(interior="field"), report=lambda line: None)
     assert given.config.model.far_field == "field"
 

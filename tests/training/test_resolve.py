@@ -142,7 +142,7 @@ def test_a_field_in_a_ball_is_in_front_of_a_backdrop():
         ("clear", {"far_field": "field", "iterations": 8}, "iterations=8 has no effect"),
         ("clear", {"interior": "field", "iterations": 8}, "iterations=8 has no effect"),
         ("clear", {"far_field": "field", "field_ball": (0, 0, 0, 2)}, "has no effect"),
-        ("clear", {"far_field": "backdrop", "field_ball": (0, 0, 0, 2)}, "Add interior=field"),
+        ("clear", {"far_field": "backdrop", "field_ball": (0, 0, 0, 2)}, "field of interior=field"),
         ("clear", {**_AROUND, "field_ball": (0, 0, 0, 0)}, "centre and a positive radius"),
         ("clear", {**_AROUND, "field_ball": (0, 0, math.nan, 1)}, r"field_ball\[2\] is NaN"),
         ("clear", {"far_field": "backdrop", "contraction": "always"}, "contraction=always"),
