@@ -279,12 +279,14 @@ def _ball(
         return None
     if (run / _CONFIG).is_file():
         return run_folder.read_config(run).model.field_ball
+    inside = "warning: the field is sampled inside the object only"
     if records.read(made).config.outliers:
+        say(f"{inside}, as --outliers says that masks may be wrong")
         return None
     try:
         box = geometry_stage.box_of_masks(Path(config.scene.path))
     except ReconstructionError as error:
-        say(f"warning: the field is sampled inside the object only, as the masks disagree: {error}")
+        say(f"{inside}, as the masks disagree: {error}")
         return None
     x, y, z = (round(float(number), 4) for number in 0.5 * (box.low + box.high))
     return x, y, z, round(0.5 * float(sum((box.high - box.low) ** 2)) ** 0.5, 4)

@@ -218,8 +218,9 @@ def render_image(
     if model.config.backdrop is None or branch != "both":
         return render(rays)
     # A field in front of a backdrop is inside objects, or in cells that masks show.
-    hull, ball = getattr(model.params.field, "hull", None), model.config.backdrop.field_ball
-    met, hits, misses = split_by_hit(model.scene.surfaces, rays, cells=ball and (hull, ball))
+    ball = model.config.backdrop.field_ball
+    cells = None if ball is None else (model.params.field.hull, ball)
+    met, hits, misses = split_by_hit(model.scene.surfaces, rays, cells=cells)
     seen = render(hits), _render_backdrop(model, misses, nothing)
     return jax.tree.map(functools.partial(merged, met), *seen)
 

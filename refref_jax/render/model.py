@@ -384,7 +384,7 @@ def look_up(
     for other, use in ((config.splats, "field=zipnerf"), (config.backdrop, "far_field=field")):
         if other is not None:
             raise ValueError(
-                f"With splats or a backdrop, there is no density to look up. Train it with {use}."
+                f"A model with splats or a backdrop has no density to look up. Train it with {use}."
             )
     if registry.has_sub_spaces(config.field):
         raise ValueError(

@@ -384,7 +384,7 @@ def read_pixels(
     Args:
       config: configuration of the run.
       scene: folder of the scene.
-      kept: mask of the pixels to draw from; all pixels by default.
+      kept: mask of the pixels to draw from; by default those that the configuration names.
     """
     frames = scene_folder.read_frames(scene, "train")
     if config.scene.pixels == "background" and kept is None:

@@ -358,7 +358,8 @@ def _resolve_far_field(
         config = config.decided(field_ball=None)
     for name in BACKDROP_ONLY:
         if (value := config.get(name)) is not None:
-            raise ValueError(f"{name}={value} has no effect without far_field=backdrop.")
+            instead = "Leave it out, or use far_field=backdrop."
+            raise ValueError(f"{name}={value} has no effect with far_field=field. {instead}")
     return config
 
 
@@ -461,9 +462,7 @@ def _resolve_training(
     config = _decide(config, reasons, why, **presets.losses_of(model, config.losses))
     blurs, rounds = len(require(config.losses.blurs)), len(model.proposals)
     if blurs != rounds:
-        raise ValueError(
-            f"There are {blurs} blurs for {rounds} proposal levels. Give one for each."
-        )
+        raise ValueError(f"{blurs} blurs for {rounds} proposal levels: give one for each, or none.")
     preset = presets.PRESETS[config.model.preset]
     steps = config.schedule.steps or preset.schedule.steps
     schedule = presets.stretched(preset.schedule, require(steps))

@@ -92,8 +92,13 @@ def test_points_in_a_ball_are_those_of_the_whole_path(bends):
         (made_paths.path([], [[1, 0, 0]], [0], segments=3), (1.0, 0.0, 0.0, 3.0), 4.0),
         (made_paths.path([], [[1, 0, 0]], [0], segments=3), (2.0, 1.5, 0.0, 1.5), 0.0),
         (made_paths.path([1.0], [[1, 0, 0], [0, 1, 0]], [0, 1]), (9.0, 0.0, 0.0, 1.0), 0.0),
+        (made_paths.path([10.0], [[1, 0, 0], [0, 1, 0]], [0, 1]), (2.0, 0.0, 0.0, 1.0), 2.0),
+        (made_paths.path([10.0], [[1, 0, 0], [0, 1, 0]], [0, 1]), (2.0, 5.0, 0.0, 1.0), 0.0),
     ],
-    ids=["beside", "behind", "around the camera", "tangent", "bends before it, and misses it"],
+    ids=[
+        *("beside", "behind", "around the camera", "tangent", "bends before it, and misses it"),
+        *("bends behind it", "bends, and is beside it all along"),
+    ],
 )
 def test_lengths_in_a_ball_at_the_extremes(path, ball, length):
     line = _in_ball(jax.tree.map(jnp.asarray, path), ball)
@@ -277,6 +282,7 @@ def test_point_at_check_grads():
 _CASES = {
     "whole_path": lambda paths, t: polylines.whole_path(paths),
     "outside_path": lambda paths, t: polylines.outside_path(paths),
+    "path_in_ball": lambda paths, t: polylines.path_in_ball(paths, (0.5, 0.0, 0.0, 3.0)),
     "point_at": lambda paths, t: polylines.point_at(polylines.outside_path(paths), t),
     "segment_at": lambda paths, t: polylines.segment_at(polylines.whole_path(paths), t),
 }

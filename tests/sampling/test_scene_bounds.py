@@ -416,7 +416,7 @@ def test_the_origin_as_centre_costs_no_operation(space):
     assert count(Domain(2.0, space, (0.0, 0.0, 1e-3))) > count(Domain(2.0, space))
 
 
-def test_values_in_a_ball_by_hand():
+def test_values_around_a_ball_by_hand():
     grid = jnp.arange(8.0).reshape(2, 2, 2)
     points = [[1.5, 2.5, 3.5], [0.5, 1.5, 2.5], [0.5, 2.5, 2.5], [3.5, 2.0, 3.0], [-9.0, 2.0, 3.0]]
     values = scene_bounds.values_around_ball(grid, (1.0, 2.0, 3.0, 1.0), jnp.asarray(points))

@@ -579,6 +579,12 @@ def test_wrong_masks_and_earlier_runs_have_no_field_around_the_object(
     config_files.write(tmp_path / "begun" / "config.json", asked.decided(interior="field"))
     assert ball("begun") is None
 
+    found = records.read(made)
+    doubtful = dataclasses.replace(found, config=dataclasses.replace(found.config, outliers=1))
+    records.write(made, doubtful)
+    assert ball("doubtful") is None and any("--outliers says" in line for line in said)
+    records.write(made, found)
+
     def fail(scene):
         raise ReconstructionError("Nothing is left after carving.")
 
