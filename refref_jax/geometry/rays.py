@@ -63,9 +63,10 @@ def chord(
       the line misses the sphere, half the length is 0 and the middle is the line's nearest point to
       the centre.
     """
-    along = numerics.dot(origin, direction)
-    beyond = numerics.dot(origin, origin) - jnp.square(radius)
-    return -along, numerics.safe_sqrt(jnp.square(along) - beyond)
+    middle = -numerics.dot(origin, direction)
+    # Not from the squares of both distances, whose difference is lost far from the sphere.
+    nearest = origin + middle * direction
+    return middle, numerics.safe_sqrt(jnp.square(radius) - numerics.dot(nearest, nearest))
 
 
 def orthonormal_basis(

@@ -266,6 +266,14 @@ def test_only_pixels_among_a_mask_are_compared_with_the_background():
     assert scene_analysis.misfits(views, painted, (), **known, among=nothing) == 0.0
 
 
+def test_masks_say_where_objects_of_a_scene_without_meshes_are():
+    known = {"space": "bounded", "size": 7.3, "centre": (0.0, 0.0, 0.0)}
+    every, beside = (
+        scene_analysis.read_misfits(BALL, (), **known, masked=masked) for masked in (False, True)
+    )
+    assert beside < scene_analysis.MOST_MISFITS < 0.5 * every
+
+
 @pytest.mark.parametrize("space", ["spherical", "bounded"])
 def test_a_wrong_size_of_the_background_is_seen_in_the_images(space):
     views = _room_views()
