@@ -6,8 +6,9 @@ Each scene is reconstructed from its images and masks as `experiments.reconstruc
 is trained with the reconstruction in front of a backdrop, with a field where masks show the object
 if the shape leaves an error, and another one along straight rays; fields, also those of opaque
 parts, have the preset `tiny` and `--steps` steps. The table has the error of the validation pixels
-(root mean square of the channels of a pixel, at most 0.15, sRGB; its mean over the pixels), the
-masked PSNR of test views, and the gain. Finished reconstructions and trainings are reused.
+(root mean square of the channels of a pixel, at most 0.15, sRGB; its mean over the pixels), where
+the field is sampled, the masked PSNR of test views, and the gain. Finished reconstructions and
+trainings are reused.
 
 Asserted is the mean gain over all scenes that are given. docs/shape_from_light_results.md lists
 scenes that led to no change of the code, and the command that renders them.
@@ -22,6 +23,7 @@ from absl import app, flags
 
 from experiments.r3f import records
 from experiments.runs import measured_runs, subprocesses
+from refref_jax.training import run_folder
 
 _SCENES = flags.DEFINE_list("scenes", None, "Folders of scenes.", required=True)
 _STEPS = flags.DEFINE_integer("steps", 1250, "Training steps of each field.", 1)
@@ -38,11 +40,14 @@ class Row(NamedTuple):
 
     Attributes:
       error: mean error of the validation pixels with the reconstructed object, sRGB.
+      field: where the field is sampled: `around` the meshes, too, `inside` them only, or nowhere
+        (`none`).
       found: masked PSNR with the reconstruction, dB.
       straight: masked PSNR along straight rays, dB.
     """
 
     error: float
+    field: str
     found: float
     straight: float
 
@@ -52,15 +57,15 @@ def main(arguments: list[str]) -> None:
     scenes = [Path(scene) for scene in _SCENES.value]
     for scene in scenes:
         measured_runs.check_masks(scene)
-    print("| scene | error | **found by light** | straight rays | gain |")
-    print("|---|---|---|---|---|", flush=True)
+    print("| scene | error | field | **found by light** | straight rays | gain |")
+    print("|---|---|---|---|---|---|", flush=True)
     gains = []
     for scene in scenes:
         row = measure(scene)
         gains.append(row.found - row.straight)
         print(
-            f"| {scene.resolve().name} | {row.error:.4f} | {row.found:.2f} | {row.straight:.2f} | "
-            f"{gains[-1]:.2f} |",
+            f"| {scene.resolve().name} | {row.error:.4f} | {row.field} | {row.found:.2f} | "
+            f"{row.straight:.2f} | {gains[-1]:.2f} |",
             flush=True,
         )
     mean = statistics.mean(gains)
@@ -88,13 +93,22 @@ def measure(scene: Path) -> Row:
     found = [f"--reconstruction={made}", "--paths=tree", "--far_field=backdrop"]
     if light.leaves_error or any(part.radiance is not None for part in light.parts):
         found += field
+    psnr = _masked(folder / "found", scene, found)
     return Row(
         error=light.after,
-        found=_masked(folder / "found", scene, found),
+        field=_place_of_field(folder / "found"),
+        found=psnr,
         straight=_masked(
             folder / "straight", scene, ["--far_field=field", "--paths=straight", *field]
         ),
     )
+
+
+def _place_of_field(run: Path) -> str:
+    model = run_folder.read_config(run).model
+    if model.interior != "field":
+        return "none"
+    return "around" if model.field_ball else "inside"
 
 
 def _masked(run: Path, scene: Path, options: Sequence[str]) -> float:

@@ -153,6 +153,19 @@ DistortionOver = Literal["outside", "everywhere"]
 """Samples that the distortion loss includes: those outside the objects, or all."""
 
 
+def check_ball(ball: BallOption) -> None:
+    """Checks the numbers of a ball in which a field is sampled.
+
+    Raises:
+      ValueError: if a number is not finite, or the radius is not positive.
+    """
+    if not (all(map(math.isfinite, ball)) and ball[3] > 0.0):
+        raise ValueError(
+            f"field_ball={','.join(map(str, ball))} is not a ball. Give its centre and a positive "
+            "radius, x,y,z,radius."
+        )
+
+
 def side_of(rays_per_pixel: int) -> int:
     """Returns the number of rays along each edge of a pixel.
 

@@ -73,12 +73,18 @@ def sample_ray(model: Model, ray: Rays) -> RaySamples:
       ray: one camera ray, with a unit direction.
 
     Raises:
-      ValueError: if the model takes no samples inside objects, or the path enters none.
+      ValueError: if the model takes no samples inside objects or has a backdrop, or the path enters
+        no object.
     """
     if model.config.interior != "field":
         raise ValueError(
             f"The model's interior is {model.config.interior}, so it has no samples inside the "
             "objects. Choose runs of methods with --interior=field, such as oracle."
+        )
+    if model.config.backdrop is not None:
+        raise ValueError(
+            "The model's far field is a backdrop, so that its samples do not cover whole paths. "
+            "Choose runs with --far_field=field."
         )
     roomy = dataclasses.replace(
         model.settings,

@@ -243,9 +243,11 @@ def with_parts(
         config = config_flags.on_top(config, {"reconstruction": folder}, say=say)
     free = config.model.interior is None and not _EXCLUDE_FIELD & config.overrides()
     if free and (why := _unexplained(made)):
-        ball = _ball(config, made, run, say)
+        config = config.decided(interior="field")
+        if "field_ball" not in config.overrides():
+            config = config.decided(field_ball=_ball(config, made, run, say))
+        ball = config.model.field_ball
         say(f"{why}; field_ball={','.join(map(str, ball))}" if ball else why)
-        config = config.decided(interior="field", field_ball=ball)
     is_given = given_index(ior) is not None
     return config.override(ior=index) if is_given else config.decided(ior=index)
 
@@ -269,9 +271,11 @@ def _ball(
     """Returns a ball around all that the training masks show, if the far field may be a backdrop.
 
     The reconstructed object may lack thin and opaque parts, which a field around it learns. A run
-    that has begun keeps its ball. Where masks are known to be wrong, there is none.
+    that has begun keeps its ball. Without masks, or with masks that are known to be wrong, there is
+    none.
     """
     from experiments.r3f import geometry_stage, records
+    from refref_jax.data import SceneError
     from refref_jax.reconstruct import ReconstructionError
     from refref_jax.training import run_folder
 
@@ -285,8 +289,8 @@ def _ball(
         return None
     try:
         box = geometry_stage.box_of_masks(Path(config.scene.path))
-    except ReconstructionError as error:
-        say(f"{inside}, as the masks disagree: {error}")
+    except (ReconstructionError, SceneError) as error:
+        say(f"{inside}, as no ball around it is known: {error}")
         return None
     x, y, z = (round(float(number), 4) for number in 0.5 * (box.low + box.high))
     return x, y, z, round(0.5 * float(sum((box.high - box.low) ** 2)) ** 0.5, 4)

@@ -173,14 +173,19 @@ def _parse(option: Option, value: Any) -> Any:
     if isinstance(value, list):
         if value == [AUTO]:
             return None
-        number = typing.get_args(_kind(option))[0]
+        number, *others = typing.get_args(_kind(option))
+        any_count = Ellipsis in others
         try:
-            return tuple(map(number, value))
+            if any_count or len(value) == 1 + len(others):
+                return tuple(map(number, value))
         except ValueError:
-            raise ValueError(
-                f"--{option.name}={','.join(value)} is not a list of numbers. Write as in "
-                f"--{option.name}={_EXAMPLES[number]}."
-            ) from None
+            pass
+        example = _EXAMPLES[number] if any_count else ",".join([*("0" for _ in others), "2"])
+        numbers = "numbers" if any_count else f"{1 + len(others)} numbers"
+        raise ValueError(
+            f"--{option.name}={','.join(value)} is not a list of {numbers}. Write as in "
+            f"--{option.name}={example}."
+        )
     return value
 
 

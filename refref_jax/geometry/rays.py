@@ -1,4 +1,4 @@
-"""Rays with the footprints of their pixels, and where one ray meets one triangle.
+"""Rays with the footprints of their pixels, and where one ray meets one triangle or sphere.
 
 All is in the world frame and world units. Directions are unit vectors, so a distance along a ray is
 arc length, never depth along an optical axis.

@@ -39,7 +39,7 @@ from refref_jax.render.backdrop import Mips
 from refref_jax.render.model import Model, ModelConfig, Params, is_backdrop, path_detail, surface_of
 from refref_jax.render.model import Rendering as Rendering
 from refref_jax.render.pixels import ALL, BRANCHES, BackdropEnds, TilePaths
-from refref_jax.sampling import scene_bounds
+from refref_jax.sampling.scene_bounds import OccupancyGrid, meets_occupied
 
 # Padding rays start this far away and point away: they hit nothing, and need no path buffers.
 _OUT_OF_REACH = 1e9
@@ -69,7 +69,7 @@ backdrop_ends = jit_quickly(
 )
 mipmap = jit_quickly(backdrop.mipmap, static_argnames="space")
 _finish = jit_quickly(pixels.finish)
-_meets_cells = jit_quickly(jax.vmap(scene_bounds.meets_cells, in_axes=(None, None, 0)))
+_meets_occupied = jit_quickly(jax.vmap(meets_occupied, in_axes=(None, 0)))
 
 RAYS_OF_A_BAND = 1 << 18
 """Maximum number of rays held at once, unless one row of pixels has more."""
@@ -206,27 +206,30 @@ def render_image(
     refuse_tracers((model.params, model.scene), instead=_INSTEAD)
     rays = jax.tree.map(np.float32, fetch(rays, instead=_INSTEAD))
     nothing = jax.device_get(pixels.blank(jax.device_put(np.zeros((0, 3), np.float32))))
-    if is_backdrop(model.config) and branch == "both":
-        return _render_backdrop(model, rays, nothing)
-    render = functools.partial(
-        in_tiles,
-        lambda tile, _, real: _render_tile(model, tile, real, chunk, branch),
-        tile=tile_for(max(rays.radii.size, TILE)),
-        nothing=nothing,
-        instead=_INSTEAD,
-    )
+    how: dict[str, Any] = {"tile": tile_for(max(rays.radii.size, TILE)), "nothing": nothing}
+
+    def render(some: Rays) -> Rendering:
+        return in_tiles(
+            lambda tile, _, real: _render_tile(model, tile, real, chunk, branch),
+            some,
+            **how,
+            instead=_INSTEAD,
+        )
+
     if model.config.backdrop is None or branch != "both":
         return render(rays)
-    # A field in front of a backdrop is inside objects, or in cells that masks show.
-    ball = model.config.backdrop.field_ball
-    cells = None if ball is None else (model.params.field.hull, ball)
-    met, hits, misses = split_by_hit(model.scene.surfaces, rays, cells=cells)
-    seen = render(hits), _render_backdrop(model, misses, nothing)
-    return jax.tree.map(functools.partial(merged, met), *seen)
+    # A field in front of a backdrop is inside objects, or in the hull of the masks.
+    ball, behind = model.config.backdrop.field_ball, _backdrop_renderer(model, how)
+    hull = None if ball is None else OccupancyGrid(model.params.field.hull, ball)
+    met, hits, misses = split_by_hit(model.scene.surfaces, rays, grid=hull)
+    seen = behind(hits, model.settings) if is_backdrop(model.config) else render(hits)
+    return jax.tree.map(functools.partial(merged, met), seen, behind(misses, STRAIGHT))
 
 
-def _render_backdrop(model: Model, rays: Rays, nothing: Rendering) -> Rendering:
-    """Renders rays in front of a backdrop; those that meet no object are straight."""
+def _backdrop_renderer(
+    model: Model, how: dict[str, Any]
+) -> Callable[[Rays, PathSettings], Rendering]:
+    """Returns a function that renders rays with nothing in front of a backdrop."""
     shape, config = model.config.backdrop, model.config
     assert shape is not None
     params, scene = jax.device_put((model.params, model.scene))
@@ -247,14 +250,11 @@ def _render_backdrop(model: Model, rays: Rays, nothing: Rendering) -> Rendering:
         return in_tiles(
             lambda tile, *_: _of_backdrop(params, mips, *look(tile, settings=settings)),
             some,
-            tile=tile_for(max(rays.radii.size, TILE)),
-            nothing=nothing,
+            **how,
             instead=_INSTEAD,
         )
 
-    met, hits, misses = split_by_hit(scene.surfaces, rays)
-    seen = render(hits, model.settings), render(misses, STRAIGHT)
-    return jax.tree.map(functools.partial(merged, met), *seen)
+    return render
 
 
 def split_by_hit(
@@ -262,20 +262,20 @@ def split_by_hit(
     rays: Rays,
     *,
     tile: int | None = None,
-    cells: Any = None,
+    grid: OccupancyGrid | None = None,
     instead: str = _INSTEAD,
 ) -> tuple[Bool[np.ndarray, "*rays"], Rays, Rays]:
     """Returns which rays meet an object, these rays and the others; `merged` joins their values.
 
-    If `cells` are a grid and its ball, rays that meet cells of it (`meets_cells`) count, too.
+    Rays that meet an occupied cell of `grid` count, too.
     """
     refuse_tracers(surfaces, instead=instead)
     rays = fetch(rays, instead=instead)
     met = np.isfinite(find_first_surface(surfaces, rays, tile=tile).distances)
-    if cells:
-        grid, ball = jax.device_put((cells[0], np.float32(cells[1])))
-        options: Any = {"tile": TILE, "nothing": np.zeros(0, bool), "instead": instead}
-        met |= in_tiles(lambda some, *_: _meets_cells(grid, ball, some), rays, **options)
+    if grid is not None:
+        grid = jax.device_put(OccupancyGrid(grid.occupancy, np.asarray(grid.ball, np.float32)))
+        how: Any = {"tile": tile_for(rays.radii.size), "nothing": np.zeros(0, bool)}
+        met |= in_tiles(lambda some, *_: _meets_occupied(grid, some), rays, **how, instead=instead)
     return met, _select(rays, met), _select(rays, ~met)
 
 

@@ -2,8 +2,7 @@
 
 The static configuration holds the fields, their sampling, and the scene bounds. It is hashable, so
 compiled functions take it as a static argument. `look_up` queries the field of a model at world
-points, without light paths, to export surfaces and point clouds; the field inside objects is
-meaningless if the model takes no samples there.
+points, for exports; inside objects it is meaningless if the model takes no samples there.
 """
 
 import dataclasses
@@ -26,6 +25,7 @@ from refref_jax.choices import (
     Space,
     SplatFilter,
     ViewDependence,
+    check_ball,
 )
 from refref_jax.fields import base, registry, tnsr
 from refref_jax.fields.base import DensityConfig, Radiance, RadianceConfig, Surface
@@ -93,8 +93,8 @@ class BackdropConfig:
         counts = self.resolution, self.most_taps
         if min(counts) < 1:
             raise ValueError(f"Resolution and taps are {counts}. Give positive numbers.")
-        if (ball := self.field_ball) and not (all(map(math.isfinite, ball)) and ball[3] > 0.0):
-            raise ValueError(f"field_ball is {ball}. Give a centre and a positive radius.")
+        if self.field_ball is not None:
+            check_ball(self.field_ball)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -272,8 +272,8 @@ class Params(NamedTuple):
 
     Attributes:
       proposals: parameters of each proposal level's density field.
-      field: parameters of the radiance field, the pyramid of a backdrop, or both (`Layers`); or
-        Gaussian splats.
+      field: parameters of the radiance field, the pyramid of a backdrop, Gaussian splats, or
+        `Layers` or `LayersWithHull` of a field in front of a backdrop.
       tints: learned tints and absorption of the parts, if any.
       gains: logarithm of the gain of each training image, up to a constant per channel, if learned;
         rendering has a gain of 1.
@@ -384,7 +384,7 @@ def look_up(
     for other, use in ((config.splats, "field=zipnerf"), (config.backdrop, "far_field=field")):
         if other is not None:
             raise ValueError(
-                f"A model with splats or a backdrop has no density to look up. Train it with {use}."
+                f"Models with splats or a backdrop have no field of all space. Train with {use}."
             )
     if registry.has_sub_spaces(config.field):
         raise ValueError(

@@ -247,8 +247,8 @@ def foreground_radiance(
         assert not isinstance(seen, Surface)  # `resolve` refuses a backdrop behind a surface
         sampled, points = line.stop > 0.0, samples.points
         if config.backdrop is not None and (ball := config.backdrop.field_ball):
-            shown = scene_bounds.values_around_ball(params.field.hull, ball, points.position) > 0.5
-            sampled &= shown | ~points.outside
+            hull = scene_bounds.OccupancyGrid(params.field.hull, ball)
+            sampled &= scene_bounds.is_occupied(hull, points.position) | ~points.outside
 
         def weigh(density: Array) -> Array:
             return _weigh(config, jnp.where(sampled, density, 0.0), samples.t)

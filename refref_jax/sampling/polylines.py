@@ -2,7 +2,8 @@
 
 A sampler works on one coordinate `t` along a path. Usually `t` is arc length. If the inside of the
 objects is known to be clear, `t` can be the arc length outside them only: the same polyline with
-its inner segments shrunk to length zero, so that no sample falls inside.
+its inner segments shrunk to length zero, so that no sample falls inside. In front of a backdrop, it
+is the arc length inside them only, or within a ball around them.
 
 An interval of a path is a conical frustum, represented by a few multisamples, each an isotropic
 Gaussian, so that a field can blur detail that is finer than the pixel's footprint. The centre line
@@ -111,7 +112,9 @@ def outside_path(path: LightPaths, *, also: tuple[int, ...] = ()) -> Polyline:
 
 
 def inside_path(path: LightPaths, *, parts: tuple[int, ...] | None = None) -> Polyline:
-    """Returns one light path whose coordinate only advances inside the objects, until its stop.
+    """Returns one light path whose coordinate only advances inside the objects.
+
+    Its stop is the end of its last segment inside, 0 if there is none.
 
     Args:
       path: one light path, with all of its segments.

@@ -2,7 +2,8 @@
 
 A bounded scene is a scaled cube, and a spherical scene is the ball in this cube. An unbounded scene
 is contracted: a ball is unchanged, and the space beyond it is contracted to a shell of the same
-thickness. All of them are around the centre of the scene.
+thickness. All of them are around the centre of the scene. An `OccupancyGrid` says where in a ball a
+field may have a density.
 
 Symbols: `t` is distance in world units, `s` the normalised coordinate in `[0, 1]` in which samplers
 work. Equal steps in `s` are short near the camera and grow with distance, so that one interval
@@ -263,36 +264,31 @@ def _ladder(
     return (1.0 + t / _scale(warp)) ** _LAMBDA
 
 
-def values_around_ball(
-    grid: Float[Array, "cells cells cells"],
-    ball: BallOption | Float[Array, "4"],
-    points: Float[Array, "points 3"],
-) -> Float[Array, " points"]:
-    """Returns the values of the cells of points, on a grid of the cube around a ball.
+class OccupancyGrid(NamedTuple):
+    """Occupancy of the cells of the cube around a ball.
 
-    Args:
-      grid: values of the cells.
+    Attributes:
+      occupancy: 1 in occupied cells, and 0 in the others.
       ball: centre and radius of the ball, world units.
-      points: points in world units; those outside the cube have the value 0.
     """
-    around, half = jnp.asarray(ball, points.dtype), 0.5 * grid.shape[0]
-    offset = (points - around[None, :3]) / around[3]
-    cells = jnp.floor(half * (offset + 1.0)).astype(jnp.int32)
-    held = jnp.clip(cells, 0, grid.shape[0] - 1)
-    return jnp.where(jnp.all(cells == held, axis=-1), grid[tuple(held.T)], 0.0)
+
+    occupancy: Float[Array | np.ndarray, "cells cells cells"]
+    ball: BallOption | Float[Array | np.ndarray, "4"]
 
 
-def meets_cells(
-    grid: Float[Array, "cells cells cells"], ball: Float[Array, "4"], ray: Rays
-) -> Bool[Array, ""]:
-    """Returns whether a straight ray meets a cell that is not 0, at steps of a quarter of a cell.
+def is_occupied(grid: OccupancyGrid, points: Float[Array, "points 3"]) -> Bool[Array, " points"]:
+    """Returns which points, in world units, are in occupied cells; none outside the cube are."""
+    ball, count = jnp.asarray(grid.ball, points.dtype), grid.occupancy.shape[0]
+    offset = (points - ball[None, :3]) / ball[3]
+    cells = jnp.floor(0.5 * count * (offset + 1.0)).astype(jnp.int32)
+    held = jnp.clip(cells, 0, count - 1)
+    return jnp.all(cells == held, axis=-1) & (grid.occupancy[tuple(held.T)] > 0.0)
 
-    Args:
-      grid: values of the cells.
-      ball: centre and radius of the ball, world units.
-      ray: the ray.
-    """
+
+def meets_occupied(grid: OccupancyGrid, ray: Rays) -> Bool[Array, ""]:
+    """Returns whether a straight ray meets an occupied cell, at steps of a quarter of a cell."""
+    ball = jnp.asarray(grid.ball, ray.origins.dtype)
     middle, half = chord(ball[3], ray.origins - ball[:3], ray.directions)
-    along = middle + half * jnp.linspace(-1.0, 1.0, 4 * grid.shape[0])
+    along = middle + half * jnp.linspace(-1.0, 1.0, 4 * grid.occupancy.shape[0])
     points = ray.origins[None] + jnp.maximum(along, 0.0)[:, None] * ray.directions[None]
-    return (half > 0.0) & jnp.any(values_around_ball(grid, ball, points) > 0.0)
+    return (half > 0.0) & jnp.any(is_occupied(grid, points))

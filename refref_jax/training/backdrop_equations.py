@@ -10,7 +10,7 @@ meet no object are straight and are not traced. A fraction of the pixels is held
 import functools
 import itertools
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +29,7 @@ from refref_jax.render import backdrop, images, learned_media, pixels
 from refref_jax.render.backdrop import Lookups, Mips, Pyramid
 from refref_jax.render.learned_media import LearnedTints
 from refref_jax.render.pixels import BackdropEnds
-from refref_jax.sampling.scene_bounds import Domain
+from refref_jax.sampling.scene_bounds import Domain, OccupancyGrid
 
 # One pixel in this many is held out.
 _HELD_OUT = 50
@@ -170,12 +170,14 @@ def warm_up(levels: Pyramid, space: Space) -> None:
     jax.block_until_ready(_mipmap_transposed(images.mipmap(levels, space), space))
 
 
-def meets(scene: Scene, cameras: Cameras, *, cells: Any = None) -> Bool[np.ndarray, "views h w"]:
-    """Returns which pixels' camera rays meet an object, or cells (`images.split_by_hit`)."""
+def meets(
+    scene: Scene, cameras: Cameras, *, grid: OccupancyGrid | None = None
+) -> Bool[np.ndarray, "views h w"]:
+    """Returns which pixels' camera rays meet an object, or an occupied cell of a grid."""
     views, found = len(cameras.poses), []
     for view in range(views):
         rays, _ = cameras_module.rays_of_views(cameras, np.array([view]), 1)
-        found.append(images.split_by_hit(scene.surfaces, rays, cells=cells)[0])
+        found.append(images.split_by_hit(scene.surfaces, rays, grid=grid)[0])
     return np.stack(found).reshape(views, cameras.height, cameras.width)
 
 

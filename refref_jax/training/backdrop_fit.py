@@ -1,7 +1,8 @@
 """Trains the backdrop of a run: reads its images, solves, and saves rounds of iterations.
 
 `solve` is the whole training of a model that is a backdrop. `behind_field` solves for the backdrop
-of a model with a field in front of it, whose steps `fit` takes afterwards.
+of a model with a field in front of it, whose steps `fit` takes afterwards; `read_front` tells which
+pixels see the field, and where masks show the object.
 """
 
 import math
@@ -15,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, UInt8
 from scipy.ndimage import distance_transform_edt
 
 from refref_jax import configuration
@@ -28,6 +29,7 @@ from refref_jax.render import backdrop, pixels
 from refref_jax.render.backdrop import Pyramid
 from refref_jax.render.checkpoint_io import SavedModel
 from refref_jax.render.model import ModelConfig, Params, init_params, path_detail, surface_of
+from refref_jax.sampling.scene_bounds import OccupancyGrid
 from refref_jax.training import backdrop_equations, backdrop_solver, run_folder
 from refref_jax.training.backdrop_equations import Block, Gains
 from refref_jax.training.config import TrainConfig, require
@@ -61,6 +63,18 @@ def _solver_of(state: TrainState) -> _SolverState:
     return stored if isinstance(stored, _SolverState) else _SolverState()
 
 
+class Front(NamedTuple):
+    """What is in front of a backdrop.
+
+    Attributes:
+      pixels: whether training pixels see more than the backdrop: an object, or a field in a ball.
+      hull: hull of the masks in the ball of a field; `None` without a ball.
+    """
+
+    pixels: Bool[np.ndarray, "views h w"]
+    hull: OccupancyGrid | None
+
+
 class _Problem(NamedTuple):
     """A backdrop to solve for.
 
@@ -72,7 +86,6 @@ class _Problem(NamedTuple):
       images: training images, 8-bit sRGB.
       among: mask of the pixels that are fitted; `None` if all are.
       traced: function that is called for each view that is traced, and may interrupt.
-      cells: occupancy of the cells around the ball of a field, and the ball; `None` without one.
     """
 
     config: TrainConfig
@@ -82,7 +95,6 @@ class _Problem(NamedTuple):
     images: UInt8[np.ndarray, "views h w 3"]
     among: Bool[np.ndarray, "views h w"] | None
     traced: Callable[[int, int], None]
-    cells: Any
 
     @property
     def share(self) -> float:
@@ -209,6 +221,7 @@ def _read(
     folder: Path,
     report: Callable[[str], None],
     stop: Callable[[], bool],
+    front: Front | None = None,
 ) -> _Problem:
     """Reads the training images of a run."""
 
@@ -219,17 +232,16 @@ def _read(
 
     frames = scene_folder.read_frames(folder, "train")
     images, among = scene_folder.read_images(frames), None
-    cells = _cells(model.config, frames)
     if config.scene.pixels == "background":
         among = image_files.well_outside(scene_folder.read_masks(frames))
-    if cells is not None:
-        among = ~backdrop_equations.meets(scene, frames.cameras, cells=cells)
+    if front is not None and front.hull is not None:
+        among = ~front.pixels
     if among is not None and not among.any():
         raise ValueError(
-            f"No pixel of the train views of {folder} lies outside the masks, so nothing shows "
-            "the background. Use images with room around the object, or check the masks."
+            f"No pixel of the train views of {folder} sees the background alone: masks or objects "
+            "fill the images. Use images with room around the object, or check the masks."
         )
-    return _Problem(config, model, scene, frames, images, among, traced, cells)
+    return _Problem(config, model, scene, frames, images, among, traced)
 
 
 def solve(
@@ -297,12 +309,13 @@ def behind_field(
     model: SavedModel,
     scene: Scene,
     folder: Path,
+    front: Front,
     progress: _Progress,
     stop: Callable[[], bool],
 ) -> TrainState:
     """Solves for the backdrop behind a field, from the pixels that see nothing but the backdrop.
 
-    If the field is sampled in a ball, the cells of its grid that all masks show are marked, too.
+    If the field is sampled in a ball, the hull of the masks is stored with the parameters, too.
 
     Args:
       run: folder of the run.
@@ -311,6 +324,7 @@ def behind_field(
       model: static part of its model.
       scene: its scene.
       folder: folder of its training images.
+      front: what is in front of the backdrop.
       progress: function of step, number of steps, and a line of text.
       stop: function that is called between iterations; if it returns `True`, solving ends.
 
@@ -318,7 +332,9 @@ def behind_field(
       KeyboardInterrupt: if `stop` returned `True`.
     """
     total = require(config.schedule.steps)
-    problem = _read(config, model, scene, folder, lambda text: progress(0, total, text), stop)
+    problem = _read(
+        config, model, scene, folder, lambda text: progress(0, total, text), stop, front
+    )
     params = state.params
     for reached in problem.iterate(run, problem.unsolved()):
         progress(0, total, f"backdrop, iteration {reached.step}  PSNR {reached.fitted:.2f}")
@@ -326,43 +342,40 @@ def behind_field(
             raise KeyboardInterrupt  # there is no new state to save
         field = params.field._replace(backdrop=reached.pyramid)
         params = params._replace(field=field, tints=reached.tints)
-    if problem.cells is not None:
-        hull = jax.device_put(problem.cells[0])
+    if front.hull is not None:
+        hull = jax.device_put(front.hull.occupancy)
         params = params._replace(field=params.field._replace(hull=hull))
     return state._replace(params=params)
 
 
-def pixels_in_front(
-    config: ModelConfig, scene: Scene, folder: Path
-) -> Bool[np.ndarray, "views h w"]:
-    """Returns which training pixels see more than a backdrop: an object, or a field in a ball.
+def read_front(config: ModelConfig, scene: Scene, folder: Path) -> Front:
+    """Reads the masks of the training images, and returns what is in front of a backdrop.
 
     Raises:
-      ValueError: if there is a ball, but no masks, or they show nothing in it.
+      ValueError: if the field is sampled in a ball, but there are no masks, or they show nothing in
+        it.
     """
-    frames = scene_folder.read_frames(folder, "train")
-    return backdrop_equations.meets(scene, frames.cameras, cells=_cells(config, frames))
+    shape, frames = config.backdrop, scene_folder.read_frames(folder, "train")
+    assert shape is not None
+    ball = shape.field_ball
+    hull = None if ball is None else _hull(frames, ball, cells=shape.hull_cells)
+    return Front(backdrop_equations.meets(scene, frames.cameras, grid=hull), hull)
 
 
-def _cells(
-    config: ModelConfig, frames: Frames
-) -> tuple[Float[np.ndarray, "cells cells cells"], BallOption] | None:
-    """Returns the grid around the ball of a field, if there is one, and the ball.
+def _hull(frames: Frames, ball: BallOption, *, cells: int) -> OccupancyGrid:
+    """Returns an occupancy grid of the masks' hull.
 
-    The grid is 1 in the hull of the masks, and 0 elsewhere. A cell is in the hull if all masks that
-    can see it show the object within its footprint or next to it, and at least one can.
+    A cell is occupied if all masks that can see it show the object within its footprint or next to
+    it, and at least one can. It may be too large, unlike the surface of `reconstruct.masks`, which
+    loses what is thinner than its cells.
 
     Source: Laurentini, The Visual Hull Concept for Silhouette-Based Image Understanding (1994).
     """
-    shape = config.backdrop
-    if shape is None or shape.field_ball is None:
-        return None
     frames, masks = scene_folder.read_object_views(frames)
-    *centre, radius = shape.field_ball
-    count, cameras = shape.hull_cells, frames.cameras
-    middles = radius * ((2.0 * np.arange(count) + 1.0) / count - 1.0)
+    (*centre, radius), cameras = ball, frames.cameras
+    middles = radius * ((2.0 * np.arange(cells) + 1.0) / cells - 1.0)
     points = np.stack(np.meshgrid(*3 * [middles], indexing="ij"), axis=-1).reshape(-1, 3) + centre
-    reach = math.sqrt(3.0) * radius / count  # half the diagonal of a cell
+    reach = math.sqrt(3.0) * radius / cells  # half the diagonal of a cell
     within, seen = np.ones(len(points), bool), np.zeros(len(points), bool)
     for mask, pose in zip(masks, cameras.poses, strict=True):
         away, left = distance_transform_edt(~mask), np.flatnonzero(within)
@@ -375,7 +388,7 @@ def _cells(
         within[left[told]] = away[row[told], column[told]] <= 1.0 + footprint
     if not np.any(within & seen):
         raise ValueError(
-            f"The masks show nothing in field_ball={shape.field_ball}. Check its position, and the "
-            "masks, of which a single wrong one suffices."
+            f"No point of field_ball={','.join(map(str, ball))} is in all masks that can see it. "
+            "One wrong mask is enough for that. Correct the masks or the ball, or leave it out."
         )
-    return (within & seen).reshape(3 * (count,)).astype(np.float32), shape.field_ball
+    return OccupancyGrid((within & seen).reshape(3 * (cells,)).astype(np.float32), ball)

@@ -246,10 +246,13 @@ class FieldConfig:
                 "positive numbers. Use a list such as samples_per_ray=32,20."
             )
         if self.multisamples not in (None, *_PATTERNS):
-            raise ValueError(f"multisamples={self.multisamples}. Give 1 (on the centre line) or 6.")
+            raise ValueError(f"multisamples is {self.multisamples}. Give 1 (the centre line) or 6.")
+        if self.field_ball is not None:
+            choices.check_ball(self.field_ball)
         ranges = dict.fromkeys(("most_pixels", "gaussians"), (1, _MOST)) | {"brightest": (1, 8)}
         ranges |= {"backdrop_resolution": (4, _CELLS), "iterations": (1, _FINEST)}
         ranges |= {"sub_spaces": (1, _MOST_SUB_SPACES), "max_res": (1, _FINEST)}
+        ranges |= {"log2_hashmap_size": (1, _MOST_ENTRIES)}
         for name, (least, most) in ranges.items():
             number = getattr(self, name)
             if number is not None and not least <= number <= most:
@@ -257,11 +260,6 @@ class FieldConfig:
         for name in ("dilation", "near", "far"):
             if (number := getattr(self, name)) is not None and not 0.0 <= number < math.inf:
                 raise ValueError(f"{name} is {number}. Give 0 or a positive number.")
-        if self.log2_hashmap_size not in (None, *range(1, _MOST_ENTRIES + 1)):
-            raise ValueError(
-                f"log2_hashmap_size is {self.log2_hashmap_size}. Give 1 to {_MOST_ENTRIES}, such "
-                "as 17 for tables of 131,072 entries."
-            )
 
 
 @dataclasses.dataclass(frozen=True)

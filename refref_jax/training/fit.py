@@ -311,8 +311,8 @@ def _train_field(
 ) -> int:
     """Trains a field, and returns the number of the last step."""
     surface = model.config.backdrop is not None
-    kept = backdrop_fit.pixels_in_front(model.config, objects, folder) if surface else None
-    sampler = read_pixels(config, folder, kept=kept)
+    front = backdrop_fit.read_front(model.config, objects, folder) if surface else None
+    sampler = read_pixels(config, folder, kept=front and front.pixels)
     set_up = functools.partial(loop.set_up, config, model.config, model.settings, objects, sampler)
     begin = functools.partial(init_state, config.seed, model.config, config.schedule)
     tasks = functools.partial(set_up, mesh=mesh, beside=loop.compile_steps), begin
@@ -325,9 +325,9 @@ def _train_field(
     elif config.model.surface_start == "meshes":
         params = learned_surface.fit(state.params, model.config, objects, seed=config.seed)
         state = devices.put_everywhere(state._replace(params=params), mesh=mesh)
-    elif surface:
+    elif front is not None:
         state = backdrop_fit.behind_field(
-            run, state, config, model, objects, folder, log.progress, log.stop
+            run, state, config, model, objects, folder, front, log.progress, log.stop
         )
     if devices.any_process(log.stop()):
         raise KeyboardInterrupt  # there is no new state to save

@@ -140,6 +140,27 @@ class Preset:
         return registry.KINDS[model.field.kind].sizes[self.size].background_samples
 
 
+def _backdrop(model: ModelConfig, asked: FieldConfig, in_front: InFront) -> BackdropConfig:
+    """Returns the backdrop of a model.
+
+    Raises:
+      ValueError: if an option needs another content in front of it.
+    """
+    if asked.exposure == "per_image" and in_front == "field":
+        raise ValueError(
+            "exposure=per_image, but this scene needs a field in front of its backdrop, which are "
+            "learned one after the other, with one exposure. Use far_field=field."
+        )
+    if asked.field_ball and (in_front, model.interior) != ("field", "field"):
+        raise ValueError("field_ball needs interior=field. Add it, or leave field_ball out.")
+    return BackdropConfig(
+        asked.backdrop_resolution or BACKDROP_RESOLUTION,
+        in_front=in_front,
+        view_dependence=asked.view_dependence or "none",
+        field_ball=asked.field_ball,
+    )
+
+
 def override_model(
     model: ModelConfig, asked: FieldConfig, *, in_front: InFront = "nothing"
 ) -> ModelConfig:
@@ -162,22 +183,8 @@ def override_model(
         given["splats"] = SplatsConfig(
             count or model.splats.gaussians, kernel or model.splats.kernel
         )
-    if asked.exposure == "per_image" and in_front == "field":
-        raise ValueError(
-            "exposure=per_image, but this scene needs a field in front of its backdrop, which are "
-            "learned one after the other, with one exposure. Use far_field=field."
-        )
     if asked.far_field == "backdrop":
-        cells = asked.backdrop_resolution or BACKDROP_RESOLUTION
-        seen = asked.view_dependence or "none"
-        given["backdrop"] = BackdropConfig(
-            cells, in_front=in_front, view_dependence=seen, field_ball=asked.field_ball
-        )
-        if asked.field_ball and (in_front, model.interior) != ("field", "field"):
-            raise ValueError(
-                "field_ball is where the field of interior=field is sampled. Add that, or leave "
-                "field_ball out."
-            )
+        given["backdrop"] = _backdrop(model, asked, in_front)
     model = dataclasses.replace(model, **{n: x for n, x in given.items() if x is not None})
     if asked.precision is not None:
         proposals = tuple(

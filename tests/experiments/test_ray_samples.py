@@ -14,6 +14,7 @@ from experiments.runs import view_numbers
 from refref_jax.geometry import cameras
 from refref_jax.optics.path_settings import PAPER
 from refref_jax.render import Model, init_params
+from refref_jax.render.model import BackdropConfig
 from tests.factories import scenes
 from tests.factories.small_model import CAMERAS, MODEL
 from tests.processes.command import ROOT, TINY, run_command
@@ -57,6 +58,8 @@ def test_the_path_is_the_heaviest_and_some_rays_and_models_have_nothing_inside()
         ray_samples.sample_ray(_model(), _ray(1.5))
     with pytest.raises(ValueError, match="interior is clear, so it has no samples inside"):
         ray_samples.sample_ray(_model(interior="clear"), _ray(0.5))
+    with pytest.raises(ValueError, match="far field is a backdrop"):
+        ray_samples.sample_ray(_model(backdrop=BackdropConfig(8, in_front="field")), _ray(0.5))
 
 
 def test_a_pixel_is_a_column_and_a_row():

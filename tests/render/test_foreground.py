@@ -126,6 +126,13 @@ def test_a_field_in_a_ball_is_empty_where_masks_show_nothing_but_inside_objects(
     np.testing.assert_allclose(depth(inside), 4.0, rtol=1e-4)  # and on to z = -2
 
 
+def test_proposals_have_weights_where_masks_show_nothing(plant):
+    # The interlevel loss compares them with weights that are blurred beyond the edge of the hull.
+    proposed, final = plant(_IN_BALL, _straight(), 0.8).histograms
+    assert np.all(np.asarray(proposed.weights) > 0.0)
+    np.testing.assert_array_equal(np.asarray(final.weights) > 0.0, final.edges[1:] < 0.6)
+
+
 def test_a_path_that_ends_on_an_opaque_surface_sees_the_field_there(plant):
     inside = made_paths.path([2.0], [(0, 0, -1), (0, 0.6, -0.8)], [0, 1], origin=(0, 0, 3))
     stopped = inside._replace(stop=Stop(jnp.float32(2.75), None))
@@ -210,5 +217,5 @@ def test_rays_that_meet_no_field_are_left_to_the_backdrop(config):
 )
 def test_rays_meet_cells_in_front_of_them(origin, direction, meets):
     ray = Rays(*(jnp.asarray(x, jnp.float32) for x in (origin, direction)), jnp.float32(1e-3))
-    ball = jnp.asarray(_IN_BALL.backdrop.field_ball)
-    assert bool(scene_bounds.meets_cells(_HULLS[_IN_BALL], ball, ray)) is meets
+    grid = scene_bounds.OccupancyGrid(_HULLS[_IN_BALL], _IN_BALL.backdrop.field_ball)
+    assert bool(scene_bounds.meets_occupied(grid, ray)) is meets

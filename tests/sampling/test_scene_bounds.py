@@ -416,8 +416,9 @@ def test_the_origin_as_centre_costs_no_operation(space):
     assert count(Domain(2.0, space, (0.0, 0.0, 1e-3))) > count(Domain(2.0, space))
 
 
-def test_values_around_a_ball_by_hand():
-    grid = jnp.arange(8.0).reshape(2, 2, 2)
+def test_an_occupancy_grid_by_hand():
+    occupancy = jnp.ones((2, 2, 2)).at[0, 0, 0].set(0.0)
     points = [[1.5, 2.5, 3.5], [0.5, 1.5, 2.5], [0.5, 2.5, 2.5], [3.5, 2.0, 3.0], [-9.0, 2.0, 3.0]]
-    values = scene_bounds.values_around_ball(grid, (1.0, 2.0, 3.0, 1.0), jnp.asarray(points))
-    np.testing.assert_array_equal(values, [7.0, 0.0, 2.0, 0.0, 0.0])
+    grid = scene_bounds.OccupancyGrid(occupancy, (1.0, 2.0, 3.0, 1.0))
+    found = scene_bounds.is_occupied(grid, jnp.asarray(points))
+    np.testing.assert_array_equal(found, [True, False, True, False, False])

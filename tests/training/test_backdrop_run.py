@@ -1,6 +1,5 @@
 """Runs with a backdrop: solved, paused and continued, rendered, and refused where none fits."""
 
-import dataclasses
 import json
 import shutil
 
@@ -14,12 +13,12 @@ import trimesh
 from refref_jax.data import image_files, meshes, scene_folder
 from refref_jax.geometry.cameras import image_rays, orbit, project
 from refref_jax.render import Model, pixels, render_image, render_rays
-from refref_jax.render.model import BackdropConfig, look_up
+from refref_jax.render.model import look_up
 from refref_jax.training import backdrop_equations, backdrop_fit, backdrop_solver, run_folder
 from refref_jax.training.config import TrainConfig
 from refref_jax.training.fit import Periods, fit, prepare
 from tests.factories.cut_ball import cut_ball
-from tests.factories.small_model import CAMERAS, MODEL
+from tests.factories.small_model import CAMERAS
 
 pytestmark = [pytest.mark.loose, pytest.mark.longest]
 
@@ -92,7 +91,7 @@ def test_images_without_a_pixel_of_background_are_refused(scene, tmp_path):
         mask = iio.imread(path)
         iio.imwrite(path, np.full_like(mask, 255))
     config = _config(copy).override(pixels="background")
-    with pytest.raises(ValueError, match="lies outside the masks"):
+    with pytest.raises(ValueError, match="sees the background alone"):
         fit(config, out=tmp_path / "run")
 
 
@@ -133,7 +132,7 @@ def test_the_radiance_has_gradients_through_the_renderer(scene, run):
 
 def test_a_model_with_a_backdrop_has_no_field_to_look_up(run):
     model = run[1]
-    with pytest.raises(ValueError, match="no density to look up"):
+    with pytest.raises(ValueError, match="no field of all space"):
         look_up(model.params, model.config, jnp.zeros(3), jnp.array([0.0, 0.0, 1.0]), width=0.1)
     with pytest.raises(ValueError, match="the model has a backdrop"):
         pixels.render_ray(model, jax.tree.map(lambda x: x[0, 0], image_rays(CAMERAS, 0)))
@@ -271,7 +270,9 @@ def test_a_field_around_a_mesh_that_is_too_small_is_where_masks_show_the_object(
     # Three views leave more than the ball, but none of it is lost.
     assert np.all(hull[away < radius] == 1.0) and np.mean(hull) < 0.5
     masks = scene_folder.read_masks(frames)
-    assert np.all(backdrop_fit.pixels_in_front(model.config, model.scene, scene)[masks])
+    front = backdrop_fit.read_front(model.config, model.scene, scene)
+    assert np.all(front.pixels[masks])
+    np.testing.assert_array_equal(front.hull.occupancy, hull)
     assert masks.sum() > 2 * backdrop_equations.meets(model.scene, frames.cameras).sum()
     seen = render_image(model, image_rays(frames.cameras, 0))
     beside = image_files.well_outside(masks)[0]
@@ -293,17 +294,13 @@ def test_a_rod_thinner_than_a_cell_is_in_the_hull(tmp_path, size):
         image_files.write_mask(tmp_path / f"{view}.png", mask)
     masks = tuple(tmp_path / f"{view}.png" for view in range(12))
     frames = scene_folder.Frames(tuple("abcdefghijkl"), masks, masks, None, cameras)
-    shape = BackdropConfig(8, in_front="field", field_ball=ball)
-    config = dataclasses.replace(MODEL, backdrop=shape)
-    grid, _ = backdrop_fit._cells(config, frames)
+    grid = backdrop_fit._hull(frames, ball, cells=96).occupancy
     cells = np.floor((rod / 1.8 + 1.0) * 0.5 * len(grid)).astype(np.int64)
     assert np.all(grid[tuple(cells.T)] == 1.0) and np.mean(grid) < 2e-3
-    far = dataclasses.replace(shape, field_ball=(9.0, 0.0, 0.0, 1.0))
-    with pytest.raises(ValueError, match=r"show nothing in field_ball=\(9"):
-        backdrop_fit._cells(dataclasses.replace(MODEL, backdrop=far), frames)
+    with pytest.raises(ValueError, match=r"No point of field_ball=9\.0,0\.0,0\.0,1\.0 is in all"):
+        backdrop_fit._hull(frames, (9.0, 0.0, 0.0, 1.0), cells=96)
     # Nothing is claimed of what no camera sees.
-    wide = dataclasses.replace(shape, field_ball=(0.0, 0.0, 0.0, 5.0))
-    grid, _ = backdrop_fit._cells(dataclasses.replace(MODEL, backdrop=wide), frames)
+    grid = backdrop_fit._hull(frames, (0.0, 0.0, 0.0, 5.0), cells=96).occupancy
     assert np.mean(grid) < 2e-3
 
 

@@ -142,8 +142,9 @@ def test_a_field_in_a_ball_is_in_front_of_a_backdrop():
         ("clear", {"far_field": "field", "iterations": 8}, "iterations=8 has no effect"),
         ("clear", {"interior": "field", "iterations": 8}, "iterations=8 has no effect"),
         ("clear", {"far_field": "field", "field_ball": (0, 0, 0, 2)}, "has no effect"),
-        ("clear", {"far_field": "backdrop", "field_ball": (0, 0, 0, 2)}, "field of interior=field"),
-        ("clear", {**_AROUND, "field_ball": (0, 0, 0, 0)}, "centre and a positive radius"),
+        ("clear", {"far_field": "backdrop", "field_ball": (0, 0, 0, 2)}, "needs interior=field"),
+        ("clear", {**_AROUND, "field_ball": (0, 0, 0, 0)}, "is not a ball. Give its centre"),
+        ("clear", {"field_ball": (0, 0, 0, math.inf)}, "is not a ball. Give its centre"),
         ("clear", {**_AROUND, "field_ball": (0, 0, math.nan, 1)}, r"field_ball\[2\] is NaN"),
         ("clear", {"far_field": "backdrop", "contraction": "always"}, "contraction=always"),
         ("clear", {"far_field": "backdrop", "paths": "straight"}, "straight rays"),
@@ -171,6 +172,22 @@ def test_a_background_beside_the_objects_may_be_a_backdrop(stated, share, expect
     assert made.config.scene.pixels == "background"
     field = resolve(asked.override(far_field="field"), facts)
     assert field.model.config.backdrop is None
+
+
+@pytest.mark.parametrize(("ball", "expected"), [((0, 0, 0, 2), "backdrop"), (None, "field")])
+def test_a_field_in_a_ball_explains_what_masks_show_in_front_of_a_backdrop(ball, expected):
+    facts = SceneFacts(
+        _CLEAR,
+        CAMERAS,
+        (),
+        None,
+        None,
+        (),
+        stated="scene.json",
+        misfits=lambda *, masked=False, **bounds: 0.0 if masked else 0.5,
+    )
+    asked = TrainConfig().override(batch=64).decided(interior="field", field_ball=ball)
+    assert resolve(asked, facts).config.model.far_field == expected
 
 
 @pytest.mark.parametrize(
@@ -311,7 +328,7 @@ def test_resolve_warns_of_what_is_doubtful():
         (_CLEAR, {"dilatation": 0.5}, "There is no option 'dilatation'"),
         (_CLEAR, {"samples_per_ray": (32,)}, "is for 0 proposal levels, but preset tiny has 1"),
         (_CLEAR, {"samples_per_ray": (32, 0)}, "not a list of positive numbers"),
-        (_CLEAR, {"multisamples": 3}, "multisamples=3"),
+        (_CLEAR, {"multisamples": 3}, "multisamples is 3"),
         (_CLEAR, {"log2_hashmap_size": 40}, "log2_hashmap_size is 40"),
         (_CLEAR, {"max_res": 3}, "max_res=3"),
         (_CLEAR, {"radius": -1.0}, "radius is -1"),

@@ -590,7 +590,31 @@ def test_wrong_masks_and_earlier_runs_have_no_field_around_the_object(
 
     monkeypatch.setattr(geometry_stage, "box_of_masks", fail)
     assert ball("new") is None
-    assert any("masks disagree: Nothing is left" in line for line in said)
+    assert any("no ball around it is known: Nothing is left" in line for line in said)
+
+
+def test_a_ball_that_is_given_is_kept_and_without_masks_there_is_none(scene, whole, tmp_path):
+    made, said = tmp_path / "made", []
+    shutil.copytree(whole, made)
+    light = records.LightFacts(kept=True, index=1.5, before=0.11, after=0.07)
+    records.write(made, dataclasses.replace(records.read(made), light=light))
+    parts, options = [scenes.ball(1.0, subdivisions=1)], {"run": tmp_path / "run", "ior": ()}
+
+    def model(scene, **given):
+        asked = TrainConfig().override(scene=str(scene), reconstruction=str(made), **given)
+        return training_body.with_parts(asked, parts, made, say=said.append, **options).model
+
+    ball = (0.0, 0.0, 0.5, 3.0)
+    for given in ({}, {"far_field": "field"}):  # which `resolve` refuses
+        found = model(scene, field_ball=ball, **given)
+        assert (found.interior, found.field_ball) == ("field", ball)
+    assert not any("inside the object only" in line for line in said)
+
+    bare = shutil.copytree(scene, tmp_path / scene.name)
+    without_masks(bare)
+    found = model(bare)
+    assert (found.interior, found.field_ball) == ("field", None)
+    assert any("inside the object only" in line and "have no masks" in line for line in said)
 
 
 @pytest.mark.slow
