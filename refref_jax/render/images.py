@@ -274,7 +274,7 @@ def split_by_hit(
     met = np.isfinite(find_first_surface(surfaces, rays, tile=tile).distances)
     if grid is not None:
         grid = jax.device_put(OccupancyGrid(grid.occupancy, np.asarray(grid.ball, np.float32)))
-        how: Any = {"tile": tile_for(rays.radii.size), "nothing": np.zeros(0, bool)}
+        how: Any = {"tile": size_for(rays.radii.size, most=TILE), "nothing": np.zeros(0, bool)}
         met |= in_tiles(lambda some, *_: _meets_occupied(grid, some), rays, **how, instead=instead)
     return met, _select(rays, met), _select(rays, ~met)
 
