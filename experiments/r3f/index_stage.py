@@ -160,8 +160,8 @@ def run(
       exposure: whether the background learns a gain for each image.
       start: index from which to descend in addition to those of the search.
       steps: training steps of the background, if it is a field.
-      wanted: how the background is learned (`resolve_background`), which takes seconds to find; its
-        options do not count then.
+      wanted: resolved options of the background (`resolve_background`), in place of those above;
+        to find them takes seconds.
 
     Raises:
       ValueError: if the scene has no masks, or no pixel outside of them.
@@ -262,8 +262,7 @@ def learn_background(
       centre: centre of the background, see `run`.
       exposure: whether it learns a gain for each image.
       steps: number of training steps of a field.
-      wanted: how it is learned (`resolve_background`), if it is known; the options above do not
-        count then.
+      wanted: resolved options (`resolve_background`), in place of those above.
 
     Raises:
       ValueError: if the scene has no masks, or no pixel outside of them, or if the training was

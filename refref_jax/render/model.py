@@ -236,8 +236,8 @@ class LayersWithHull(NamedTuple):
     """Layers with a field in a ball; a type of its own, as checkpoints of `Layers` have no hull.
 
     Attributes:
-      field: as in `Layers`.
-      backdrop: as in `Layers`.
+      field: parameters of the radiance field.
+      backdrop: radiance of each level of the surface.
       hull: occupancy of the cells of the cube around `field_ball`: 1 in the masks' hull, else 0.
     """
 
@@ -384,7 +384,7 @@ def look_up(
     for other, use in ((config.splats, "field=zipnerf"), (config.backdrop, "far_field=field")):
         if other is not None:
             raise ValueError(
-                f"Models with splats or a backdrop have no field of all space. Train with {use}."
+                f"Models with splats or a backdrop have no density at a point. Train with {use}."
             )
     if registry.has_sub_spaces(config.field):
         raise ValueError(

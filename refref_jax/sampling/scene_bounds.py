@@ -268,7 +268,7 @@ class OccupancyGrid(NamedTuple):
     """Occupancy of the cells of the cube around a ball.
 
     Attributes:
-      occupancy: 1 in occupied cells, and 0 in the others.
+      occupancy: occupancy of each cell, 1 or 0.
       ball: centre and radius of the ball, world units.
     """
 

@@ -132,7 +132,7 @@ def test_the_radiance_has_gradients_through_the_renderer(scene, run):
 
 def test_a_model_with_a_backdrop_has_no_field_to_look_up(run):
     model = run[1]
-    with pytest.raises(ValueError, match="no field of all space"):
+    with pytest.raises(ValueError, match="no density at a point"):
         look_up(model.params, model.config, jnp.zeros(3), jnp.array([0.0, 0.0, 1.0]), width=0.1)
     with pytest.raises(ValueError, match="the model has a backdrop"):
         pixels.render_ray(model, jax.tree.map(lambda x: x[0, 0], image_rays(CAMERAS, 0)))

@@ -174,6 +174,14 @@ def test_a_background_beside_the_objects_may_be_a_backdrop(stated, share, expect
     assert field.model.config.backdrop is None
 
 
+def test_gains_of_images_are_learned_with_a_field_inside_unless_a_backdrop_is_behind_it():
+    given = {"interior": "field", "exposure": "per_image"}
+    made = _resolve(_CLEAR, far_field="field", **given)
+    assert made.model.config.learned_gains == len(CAMERAS.poses)
+    with pytest.raises(ValueError, match=r"with one exposure\. Use far_field=field"):
+        _resolve(_CLEAR, far_field="backdrop", **given)
+
+
 @pytest.mark.parametrize(("ball", "expected"), [((0, 0, 0, 2), "backdrop"), (None, "field")])
 def test_a_field_in_a_ball_explains_what_masks_show_in_front_of_a_backdrop(ball, expected):
     facts = SceneFacts(

@@ -145,7 +145,7 @@ def test_what_needs_rays_or_a_field_is_refused_in_one_sentence(trained):
     for render in (images.render_image, pixels.render_rays):
         with pytest.raises(ValueError, match=r"Gaussian splats, which are seen by cameras"):
             render(model, jax.tree.map(lambda x: x[0], rays))
-    with pytest.raises(ValueError, match=r"no field of all space\. Train it with field=zipnerf"):
+    with pytest.raises(ValueError, match=r"no density at a point\. Train with field=zipnerf"):
         look_up(model.params, model.config, jnp.zeros(3), jnp.ones(3), width=0.1)
     kept = model.config.splats
     classic = model._replace(
