@@ -124,8 +124,8 @@ def _with_field(run: Path) -> Model:
         )
     if model.config.backdrop is not None:
         raise ValueError(
-            f"{run} has a backdrop, which has no density. Use --what=textured_mesh, faces or "
-            "panorama."
+            f"The far field of {run} is a backdrop, which has no density. Use "
+            "--what=textured_mesh, faces or panorama."
         )
     if registry.has_sub_spaces(model.config.field):
         raise ValueError(

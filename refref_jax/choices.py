@@ -157,9 +157,9 @@ def check_ball(ball: BallOption) -> None:
     """Checks the numbers of a ball in which a field is sampled.
 
     Raises:
-      ValueError: if a number is not finite, or the radius is not positive.
+      ValueError: if these are not four finite numbers, or the radius is not positive.
     """
-    if not (all(map(math.isfinite, ball)) and ball[3] > 0.0):
+    if not (len(ball) == 4 and all(map(math.isfinite, ball)) and ball[3] > 0.0):
         raise ValueError(
             f"field_ball={','.join(map(str, ball))} is not a ball. Give its centre and a positive "
             "radius, x,y,z,radius."

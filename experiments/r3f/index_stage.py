@@ -161,7 +161,7 @@ def run(
       start: index from which to descend in addition to those of the search.
       steps: training steps of the background, if it is a field.
       wanted: resolved options of the background (`resolve_background`), in place of those above;
-        to find them takes seconds.
+        resolving them takes seconds.
 
     Raises:
       ValueError: if the scene has no masks, or no pixel outside of them.

@@ -33,9 +33,6 @@ FLAGS = (METHOD, *_RECONSTRUCTED)
 
 Options = Mapping[str, flags.FlagHolder]
 
-# Options that have no effect with a field inside the object, or that it refuses.
-_EXCLUDE_FIELD = {"tints", "tint_decay", "exposure"}
-
 # File of a run that has begun.
 _CONFIG = "config.json"
 
@@ -241,28 +238,43 @@ def with_parts(
         config = config.decided(reconstruction=folder)
     else:
         config = config_flags.on_top(config, {"reconstruction": folder}, say=say)
-    free = config.model.interior is None and not _EXCLUDE_FIELD & config.overrides()
-    if free and (why := _unexplained(made)):
-        config = config.decided(interior="field")
-        if "field_ball" not in config.overrides():
-            config = config.decided(field_ball=_ball(config, made, run, say))
-        ball = config.model.field_ball
-        say(f"{why}; field_ball={','.join(map(str, ball))}" if ball else why)
+    if config.model.interior is None and (left := _unexplained(made)):
+        if option := _excludes_field(config):
+            say(f"{left}, of which a field would learn a part; {option} excludes one")
+        else:
+            config = config.decided(interior="field")
+            if "field_ball" not in config.overrides():
+                config = config.decided(field_ball=_ball(config, made, run, say))
+            say(_field_inside(left, config.model.field_ball))
     is_given = given_index(ior) is not None
     return config.override(ior=index) if is_given else config.decided(ior=index)
 
 
 def _unexplained(made: Path) -> str:
-    """Returns why the inside of an object is a field; empty if its shape explains the images."""
+    """Returns what the shape of an object leaves unexplained; empty if it explains the images."""
     from experiments.r3f import records
 
     light = records.read(made).light
     if light is None or light.after is None or not light.leaves_error:
         return ""
-    return (
-        f"interior=field: the shape leaves an error of {light.after:.4f}; a field learns a part of "
-        "it; --interior=absorbing leaves it out and is faster"
-    )
+    return f"the shape leaves an error of {light.after:.4f}"
+
+
+def _excludes_field(config: TrainConfig) -> str:
+    """Returns the option of a configuration that excludes a field inside; empty if none does."""
+    model, given = config.model, config.overrides()
+    if model.exposure == "per_image" and model.far_field != "field":
+        return "exposure=per_image without far_field=field"
+    if "tints" in given and model.tints != "none":
+        return f"tints={model.tints}"
+    return "tint_decay" if "tint_decay" in given else ""
+
+
+def _field_inside(left: str, ball: choices.BallOption | None) -> str:
+    """Returns why the inside of an object is a field, and where else that is sampled."""
+    at = f", in field_ball={','.join(map(str, ball))} where masks show the object" if ball else ""
+    why = f"{left}, of which a field learns a part{at}"
+    return f"interior=field: {why}. --interior=absorbing is faster and has none"
 
 
 def _ball(

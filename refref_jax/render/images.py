@@ -218,7 +218,7 @@ def render_image(
 
     if model.config.backdrop is None or branch != "both":
         return render(rays)
-    # A field in front of a backdrop is inside objects, or in the hull of the masks.
+    # A field in front of a backdrop is on or inside objects, or in the hull of the masks.
     ball, behind = model.config.backdrop.field_ball, _backdrop_renderer(model, how)
     hull = None if ball is None else OccupancyGrid(model.params.field.hull, ball)
     met, hits, misses = split_by_hit(model.scene.surfaces, rays, grid=hull)
@@ -229,7 +229,7 @@ def render_image(
 def _backdrop_renderer(
     model: Model, how: dict[str, Any]
 ) -> Callable[[Rays, PathSettings], Rendering]:
-    """Returns a function that renders rays with nothing in front of a backdrop."""
+    """Returns a function of rays and path settings that renders a backdrop without a field."""
     shape, config = model.config.backdrop, model.config
     assert shape is not None
     params, scene = jax.device_put((model.params, model.scene))

@@ -90,9 +90,9 @@ class BackdropConfig:
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
-        counts = self.resolution, self.most_taps
+        counts = self.resolution, self.most_taps, self.hull_cells
         if min(counts) < 1:
-            raise ValueError(f"Resolution and taps are {counts}. Give positive numbers.")
+            raise ValueError(f"Resolution, taps and cells are {counts}. Give positive numbers.")
         if self.field_ball is not None:
             check_ball(self.field_ball)
 

@@ -397,8 +397,9 @@ def distance_warp(config: ModelConfig, line: Polyline) -> scene_bounds.DistanceW
 def polyline(config: ModelConfig, path: LightPaths) -> Polyline:
     """Returns the polyline that a model samples: without the segments that it takes to be empty."""
     if config.backdrop is not None:
-        if config.backdrop.field_ball is not None:
-            return polylines.path_in_ball(path, config.backdrop.field_ball)
+        if (ball := config.backdrop.field_ball) is not None:
+            end = scene_bounds.background_distance(config.domain, polylines.whole_path(path))
+            return polylines.path_in_ball(path, ball, end=end)
         return polylines.inside_path(
             path, parts=None if config.interior == "field" else config.field_parts
         )

@@ -129,15 +129,19 @@ def inside_path(path: LightPaths, *, parts: tuple[int, ...] | None = None) -> Po
     return line._replace(stop=jnp.max(line.knots, where=jnp.isfinite(line.knots), initial=0.0))
 
 
-def path_in_ball(path: LightPaths, ball: BallOption) -> Polyline:
+def path_in_ball(
+    path: LightPaths, ball: BallOption, *, end: Float[Array, ""] | float = math.inf
+) -> Polyline:
     """Returns one light path whose coordinate advances from a ball's surface to its surface.
 
     Its first and last segment are cut by the ball, and those between bends are kept whole. Its stop
-    is where the path leaves the ball or ends on an opaque surface; 0 for a path beside the ball.
+    is where the path leaves the ball, or ends on an opaque surface or the background; 0 for a path
+    beside the ball.
 
     Args:
       path: one light path, with all of its segments.
       ball: centre and radius of the ball, world units.
+      end: distance of the background from the start of the last segment.
     """
     *centre, radius = ball
     line, used = whole_path(path), jnp.isfinite(path.tau)
@@ -147,6 +151,7 @@ def path_in_ball(path: LightPaths, ball: BallOption) -> Polyline:
     leave = jnp.where(half > 0.0, jnp.maximum(middle + half, 0.0), 0.0)
     if line.stop is not None:
         leave = jnp.minimum(leave, line.stop - line.arcs)
+    leave = jnp.where(slots == last, jnp.minimum(leave, end), leave)
     ends = jnp.where(slots == last, leave, path.ends - line.arcs)
     ends = jnp.where(slots == 0, jnp.minimum(ends, leave), ends)
     starts = jnp.where(slots == 0, jnp.clip(middle - half, 0.0, ends), 0.0)

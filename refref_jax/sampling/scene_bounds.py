@@ -21,7 +21,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax import numerics
 from refref_jax.choices import ORIGIN, BallOption, Position, Space
@@ -40,6 +40,9 @@ costs 2.7 dB.
 
 SHORTEST = 1e-3
 """Minimum length of a path, in units of the scene radius: `s` keeps four digits in float32."""
+
+_ROUNDING = 1e-6
+"""Distance from a sphere, in its radius, at which a ray may start on it."""
 
 _NEAR = 0.05
 _FAR_UNBOUNDED = 1000.0
@@ -167,7 +170,9 @@ def exit_distance(
     origin = _from_centre(domain, origin)
     if domain.space == "spherical":
         middle, half = chord(domain.radius, origin, direction)
-        return jnp.where((half > 0.0) & (middle + half >= 0.0), middle + half, jnp.inf)
+        leave = middle + half
+        ahead = (half > 0.0) & (leave >= -_ROUNDING * domain.radius)
+        return jnp.where(ahead, jnp.maximum(leave, 0.0), jnp.inf)
     inverse = numerics.safe_reciprocal(direction)
     first = (-domain.radius - origin) * inverse
     second = (domain.radius - origin) * inverse
@@ -214,6 +219,20 @@ class DistanceWarp(NamedTuple):
     unit: float
 
 
+def background_distance(domain: Domain, line: Polyline) -> Float[Array, ""]:
+    """Returns the distance of the scene bounds from the start of a path's last segment.
+
+    It is `inf` where there are none, and has no gradient, see `exit_distance`.
+    """
+    last = _last_segment(line)
+    leave = exit_distance(domain, line.points[last], line.directions[last])
+    return jax.lax.stop_gradient(leave)
+
+
+def _last_segment(line: Polyline) -> Int[Array, ""]:
+    return jnp.sum(jnp.isfinite(line.knots)) - 1
+
+
 def warp_along(domain: Domain, line: Polyline, *, near: float, far: float) -> DistanceWarp:
     """Returns the distance warp of a path, which ends on an opaque surface or the scene bounds.
 
@@ -226,9 +245,7 @@ def warp_along(domain: Domain, line: Polyline, *, near: float, far: float) -> Di
       near: distance of the first sample, world units.
       far: distance of the last sample from the last bend, where the path misses the bounds.
     """
-    last = jnp.sum(jnp.isfinite(line.knots)) - 1
-    leave = exit_distance(domain, line.points[last], line.directions[last])
-    leave = jax.lax.stop_gradient(leave)
+    last, leave = _last_segment(line), background_distance(domain, line)
     end = line.knots[last] + jnp.where(jnp.isfinite(leave), leave, far)
     if line.stop is not None:
         end = jnp.where(jnp.isfinite(line.stop), line.stop, end)
@@ -264,6 +281,19 @@ def _ladder(
     return (1.0 + t / _scale(warp)) ** _LAMBDA
 
 
+def check_size(domain: Domain, ball: BallOption) -> None:
+    """Checks that a ball in which a field is sampled is no larger than the background.
+
+    Raises:
+      ValueError: if it is: the cells of its grid would be too large for an object.
+    """
+    if domain.space != "unbounded" and ball[3] > domain.radius:
+        raise ValueError(
+            f"field_ball={','.join(map(str, ball))} is larger than the background, whose radius is "
+            f"{domain.radius:g}. Give a ball around the object."
+        )
+
+
 class OccupancyGrid(NamedTuple):
     """Occupancy of the cells of the cube around a ball.
 
@@ -281,12 +311,15 @@ def is_occupied(grid: OccupancyGrid, points: Float[Array, "points 3"]) -> Bool[A
     ball, count = jnp.asarray(grid.ball, points.dtype), grid.occupancy.shape[0]
     offset = (points - ball[None, :3]) / ball[3]
     cells = jnp.floor(0.5 * count * (offset + 1.0)).astype(jnp.int32)
-    held = jnp.clip(cells, 0, count - 1)
-    return jnp.all(cells == held, axis=-1) & (grid.occupancy[tuple(held.T)] > 0.0)
+    occupancy = jnp.asarray(grid.occupancy)[tuple(jnp.clip(cells, 0, count - 1).T)]
+    return jnp.all(jnp.abs(offset) < 1.0, axis=-1) & (occupancy > 0.0)
 
 
 def meets_occupied(grid: OccupancyGrid, ray: Rays) -> Bool[Array, ""]:
-    """Returns whether a straight ray meets an occupied cell, at steps of a quarter of a cell."""
+    """Returns whether a straight ray meets an occupied cell within the ball.
+
+    It is looked for at steps of a quarter of a cell.
+    """
     ball = jnp.asarray(grid.ball, ray.origins.dtype)
     middle, half = chord(ball[3], ray.origins - ball[:3], ray.directions)
     along = middle + half * jnp.linspace(-1.0, 1.0, 4 * grid.occupancy.shape[0])

@@ -365,9 +365,9 @@ def read_front(config: ModelConfig, scene: Scene, folder: Path) -> Front:
 def _hull(frames: Frames, ball: BallOption, *, cells: int) -> OccupancyGrid:
     """Returns an occupancy grid of the masks' hull.
 
-    A cell is occupied if all masks that can see it show the object within its footprint or next to
-    it, and at least one can. It may be too large, unlike the surface of `reconstruct.masks`, which
-    loses what is thinner than its cells.
+    A cell is occupied if at least one camera sees it, and all masks of those that do show the
+    object no farther from it than its footprint and a pixel. The hull may be too large, unlike the
+    surface of `reconstruct.masks`, which loses what is thinner than its cells.
 
     Source: Laurentini, The Visual Hull Concept for Silhouette-Based Image Understanding (1994).
     """
@@ -389,6 +389,7 @@ def _hull(frames: Frames, ball: BallOption, *, cells: int) -> OccupancyGrid:
     if not np.any(within & seen):
         raise ValueError(
             f"No point of field_ball={','.join(map(str, ball))} is in all masks that can see it. "
-            "One wrong mask is enough for that. Correct the masks or the ball, or leave it out."
+            "One wrong mask is enough for that. Correct the masks or the ball, or use "
+            "interior=field without a ball."
         )
     return OccupancyGrid((within & seen).reshape(3 * (cells,)).astype(np.float32), ball)

@@ -46,7 +46,7 @@ from refref_jax.fields import hash_grid, msnerf, registry
 from refref_jax.fields.base import RadianceConfig
 from refref_jax.fields.hash_grid import HashGridConfig
 from refref_jax.render.model import BackdropConfig, ModelConfig, ProposalConfig, SplatsConfig
-from refref_jax.sampling.scene_bounds import Bounds
+from refref_jax.sampling.scene_bounds import Bounds, check_size
 from refref_jax.training import learned_surface
 from refref_jax.training.config import (
     BACKDROP_ONLY,
@@ -134,8 +134,7 @@ class Preset:
         Returns `None` if this size is not known to need fewer samples then, or a model has other
         paths, or samples inside the objects.
         """
-        inside = model.interior == "field" or model.field_parts
-        if inside or model.space == "unbounded":
+        if model.interior == "field" or model.field_parts or model.space == "unbounded":
             return None
         return registry.KINDS[model.field.kind].sizes[self.size].background_samples
 
@@ -144,15 +143,17 @@ def _backdrop(model: ModelConfig, asked: FieldConfig, in_front: InFront) -> Back
     """Returns the backdrop of a model.
 
     Raises:
-      ValueError: if an option needs another content in front of it.
+      ValueError: if an option needs another content in front of it, or the ball is too large.
     """
     if asked.exposure == "per_image" and in_front == "field":
         raise ValueError(
-            "exposure=per_image, but this scene needs a field in front of its backdrop, which are "
-            "learned one after the other, with one exposure. Use far_field=field."
+            "exposure=per_image is learned with a backdrop, but not if a field is in front of it. "
+            "Use exposure=fixed, or far_field=field without field_ball."
         )
     if asked.field_ball and (in_front, model.interior) != ("field", "field"):
         raise ValueError("field_ball needs interior=field. Add it, or leave field_ball out.")
+    if asked.field_ball:
+        check_size(model.domain, asked.field_ball)
     return BackdropConfig(
         asked.backdrop_resolution or BACKDROP_RESOLUTION,
         in_front=in_front,
@@ -176,8 +177,7 @@ def override_model(
     """
     if asked.samples_per_ray is not None:
         model = _with_samples(model, asked.samples_per_ray, asked.preset)
-    names = ("multisamples", "footprint", "dilation")
-    given = {name: getattr(asked, name) for name in names}
+    given = {name: getattr(asked, name) for name in ("multisamples", "footprint", "dilation")}
     if model.splats is not None:
         count, kernel = asked.gaussians, asked.splat_filter
         given["splats"] = SplatsConfig(

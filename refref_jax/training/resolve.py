@@ -365,13 +365,14 @@ def _resolve_far_field(
 
 def _needs_of_a_field(config: TrainConfig, facts: SceneFacts) -> list[str]:
     """Returns what a backdrop cannot model, even with a field in front of it."""
-    field, bent = config.model.field, ("raydef", "raydef_polyline", "rosenerf")
-    surfaces = ("neus", "unisurf", "nunerf", "tnsr")
+    others = ("neus", "unisurf", "nunerf", "tnsr", "raydef", "raydef_polyline", "rosenerf")
     needs = {
-        "Gaussian splats (field=splats)": field == presets.SPLATS,
+        "Gaussian splats (field=splats)": config.model.field == presets.SPLATS,
         "straight rays (paths=straight)": facts.analysis.parts > 0 and not config.paths.max_bends,
         "contraction=always": config.model.contraction == "always",
-        f"a surface or deformation (field={field})": field in (*surfaces, *bent),
+        f"a surface or deformation (field={config.model.field})": config.model.field in others,
+        "a field whose pixels are left out (pixels=background)": config.scene.pixels == "background"
+        and bool(_in_front(config, facts)),
     }
     return [name for name, holds in needs.items() if holds]
 

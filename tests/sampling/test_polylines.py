@@ -8,7 +8,7 @@ import pytest
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import light_paths
 from refref_jax.optics.light_paths import PathStatus
-from refref_jax.sampling import polylines
+from refref_jax.sampling import polylines, scene_bounds
 from tests.factories import made_paths
 from tests.laws import gradients, transformations
 from tests.oracles import reference_sampling
@@ -104,6 +104,15 @@ def test_lengths_in_a_ball_at_the_extremes(path, ball, length):
     line = _in_ball(jax.tree.map(jnp.asarray, path), ball)
     np.testing.assert_allclose(line.stop, length, atol=1e-5)
     assert np.all(np.isfinite(_at(line, [0.0, length]).position))
+
+
+@pytest.mark.parametrize(("away", "length"), [(1.0, 2.0), (6.5, 1.5), (7.5, 0.5), (12.0, 0.0)])
+def test_a_path_in_a_ball_ends_on_the_background(away, length):
+    path = jax.tree.map(jnp.asarray, made_paths.path([], [[1, 0, 0]], [0], segments=3))
+    room, whole = scene_bounds.Domain(7.0, "bounded"), polylines.whole_path(path)
+    end = scene_bounds.background_distance(room, whole)
+    line = polylines.path_in_ball(path, (away, 0.0, 0.0, 1.0), end=end)
+    np.testing.assert_allclose(line.stop, length, atol=1e-5)
 
 
 def test_a_path_in_a_ball_ends_on_an_opaque_surface():

@@ -8,7 +8,7 @@ import pytest
 from refref_jax.sampling import scene_bounds
 from refref_jax.sampling.polylines import Gaussians
 from refref_jax.sampling.scene_bounds import DistanceWarp, Domain
-from tests.factories import arrays
+from tests.factories import arrays, scenes
 from tests.laws import gradients, transformations
 from tests.oracles import reference_sampling
 
@@ -100,6 +100,18 @@ def test_exit_lies_on_the_bounds(space, order, radius):
 )
 def test_exit_distance_of_a_ball_by_hand(origin, direction, expected):
     _assert_exit(_SPHERICAL, origin, direction, expected)
+
+
+def test_rays_leave_a_sphere_at_once_where_they_start_on_it():
+    domain, rng = Domain(7.3, "spherical"), np.random.default_rng(0)
+    normals, others = rng.normal(size=(2, 1000, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    tilted = normals + 5.0 * np.cross(normals, others)  # some rays are nearly tangent
+    tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
+    leave = jax.vmap(scene_bounds.exit_distance, in_axes=(None, 0, 0))
+    for directions in (normals, tilted):
+        found = leave(domain, jnp.asarray(7.3 * normals), jnp.asarray(directions))
+        np.testing.assert_allclose(found, 0.0, atol=5e-5)
 
 
 def test_gradients_of_an_exit_are_finite_everywhere():
@@ -422,3 +434,26 @@ def test_an_occupancy_grid_by_hand():
     grid = scene_bounds.OccupancyGrid(occupancy, (1.0, 2.0, 3.0, 1.0))
     found = scene_bounds.is_occupied(grid, jnp.asarray(points))
     np.testing.assert_array_equal(found, [True, False, True, False, False])
+
+
+def test_no_point_is_in_a_cell_that_is_infinite_or_nan():
+    grid = scene_bounds.OccupancyGrid(np.ones((2, 2, 2), np.float32), (0.0, 0.0, 0.0, 1.0))
+    points = np.array([[np.nan, 0, 0], [0, np.inf, 0], [0, 0, -np.inf], [1e30, 0, 0], [0, 0, 0]])
+    found = jax.jit(scene_bounds.is_occupied)(grid, jnp.asarray(points, jnp.float32))
+    np.testing.assert_array_equal(found, [False, False, False, False, True])
+
+
+def test_rays_meet_the_cells_of_a_numpy_grid_under_transformations():
+    grid = scene_bounds.OccupancyGrid(np.zeros((4, 4, 4), np.float32), (0.0, 0.0, 0.0, 1.0))
+    grid.occupancy[2, 2, 2] = 1.0
+    ray = scenes.rays([[-5.0, 0.2, 0.2], [-5.0, -0.2, 0.2], [0.2, 0.2, 0.2]], 3 * [[1.0, 0.0, 0.0]])
+    found = jax.jit(jax.vmap(lambda one: scene_bounds.meets_occupied(grid, one)))(ray)
+    np.testing.assert_array_equal(found, [True, False, True])
+
+
+@pytest.mark.parametrize("space", ["bounded", "spherical"])
+def test_a_ball_is_no_larger_than_the_background(space):
+    scene_bounds.check_size(Domain(2.0, space), (0.0, 0.0, -1.5, 2.0))
+    scene_bounds.check_size(Domain(2.0, "unbounded"), (0.0, 0.0, 0.0, 200.0))
+    with pytest.raises(ValueError, match="is larger than the background"):
+        scene_bounds.check_size(Domain(2.0, space), (0.0, 0.0, 0.0, 2.5))

@@ -144,6 +144,8 @@ def test_a_field_in_a_ball_is_in_front_of_a_backdrop():
         ("clear", {"far_field": "field", "field_ball": (0, 0, 0, 2)}, "has no effect"),
         ("clear", {"far_field": "backdrop", "field_ball": (0, 0, 0, 2)}, "needs interior=field"),
         ("clear", {**_AROUND, "field_ball": (0, 0, 0, 0)}, "is not a ball. Give its centre"),
+        ("clear", {**_AROUND, "field_ball": (0, 0, 0, 200)}, "larger than the background"),
+        ("clear", {**_AROUND, "pixels": "background"}, "pixels are left out .pixels=background"),
         ("clear", {"field_ball": (0, 0, 0, math.inf)}, "is not a ball. Give its centre"),
         ("clear", {**_AROUND, "field_ball": (0, 0, math.nan, 1)}, r"field_ball\[2\] is NaN"),
         ("clear", {"far_field": "backdrop", "contraction": "always"}, "contraction=always"),
@@ -178,7 +180,7 @@ def test_gains_of_images_are_learned_with_a_field_inside_unless_a_backdrop_is_be
     given = {"interior": "field", "exposure": "per_image"}
     made = _resolve(_CLEAR, far_field="field", **given)
     assert made.model.config.learned_gains == len(CAMERAS.poses)
-    with pytest.raises(ValueError, match=r"with one exposure\. Use far_field=field"):
+    with pytest.raises(ValueError, match=r"exposure=fixed, or far_field=field without"):
         _resolve(_CLEAR, far_field="backdrop", **given)
 
 

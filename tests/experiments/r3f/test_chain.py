@@ -535,7 +535,11 @@ def test_an_object_that_no_model_explains_is_told(after, doubted):
         (0.07, {}, "field"),
         (0.07, {"interior": "clear"}, "clear"),
         (0.07, {"tints": "learned"}, None),
+        (0.07, {"tints": "none"}, "field"),
+        (0.07, {"tint_decay": 0.01}, None),
+        (0.07, {"exposure": "fixed"}, "field"),
         (0.07, {"exposure": "per_image"}, None),
+        (0.07, {"exposure": "per_image", "far_field": "field"}, "field"),
         (0.07, {"far_field": "field"}, "field"),
         (None, {}, None),
     ],
@@ -551,7 +555,11 @@ def test_a_field_learns_what_a_shape_leaves_unexplained_where_masks_show_it(
     parts, run = [scenes.ball(1.0, subdivisions=1)], tmp_path / "run"
     config = training_body.with_parts(asked, parts, made, run=run, ior=(), say=said.append)
     assert config.model.interior == interior
-    assert any("error of 0.0700" in line for line in said) == (interior == "field")
+    told = any("error of 0.0700" in line for line in said)
+    assert told == (after == 0.07 and interior != "clear")
+    excluding = [line for line in said if "excludes one" in line]
+    assert bool(excluding) == (told and interior is None)
+    assert all(name in line for line in excluding for name in given)
     ball = config.model.field_ball
     assert (ball is not None) == (interior == "field" and "far_field" not in given)
     if ball is not None:
