@@ -33,8 +33,8 @@ FLAGS = (METHOD, *_RECONSTRUCTED)
 
 Options = Mapping[str, flags.FlagHolder]
 
-# File of a run that has begun.
-_CONFIG = "config.json"
+# File of a run that has begun, and where a field in front of a backdrop is sampled.
+_CONFIG, _AROUND = "config.json", "In front of a backdrop, it is sampled in field_ball="
 
 FOLDER = "r3f"
 """Folder of the reconstruction, relative to the run's folder."""
@@ -239,15 +239,37 @@ def with_parts(
     else:
         config = config_flags.on_top(config, {"reconstruction": folder}, say=say)
     if config.model.interior is None and (left := _unexplained(made)):
-        if option := _excludes_field(config):
-            say(f"{left}, of which a field would learn a part; {option} excludes one")
-        else:
-            config = config.decided(interior="field")
-            if "field_ball" not in config.overrides():
-                config = config.decided(field_ball=_ball(config, made, run, say))
-            say(_field_inside(left, config.model.field_ball))
+        config = _with_field(config, left, made, run, say)
     is_given = given_index(ior) is not None
     return config.override(ior=index) if is_given else config.decided(ior=index)
+
+
+def _with_field(
+    config: TrainConfig, left: str, made: Path, run: Path, say: config_flags.Say
+) -> TrainConfig:
+    """Returns a configuration with a field inside the object, unless an option excludes it.
+
+    A run that has begun keeps what was decided then.
+    """
+    from refref_jax.training import run_folder
+
+    if (run / _CONFIG).is_file():
+        begun = run_folder.read_config(run).model
+        if begun.interior != "field":
+            return config
+        ball = begun.field_ball
+    elif option := _excludes_field(config):
+        say(f"{left}; a field inside would learn part of it, but {option} excludes one")
+        return config
+    else:
+        ball = config.model.field_ball or _ball(config, made, say)
+        where = f"{_AROUND}{','.join(map(str, ball))}, where masks show it. " if ball else ""
+        say(
+            f"interior=field: {left}; a field learns part of it. {where}Use --interior=absorbing "
+            "to train faster, without it."
+        )
+    config = config.decided(interior="field")
+    return config if "field_ball" in config.overrides() else config.decided(field_ball=ball)
 
 
 def _unexplained(made: Path) -> str:
@@ -263,38 +285,28 @@ def _unexplained(made: Path) -> str:
 def _excludes_field(config: TrainConfig) -> str:
     """Returns the option of a configuration that excludes a field inside; empty if none does."""
     model, given = config.model, config.overrides()
-    if model.exposure == "per_image" and model.far_field != "field":
-        return "exposure=per_image without far_field=field"
-    if "tints" in given and model.tints != "none":
-        return f"tints={model.tints}"
-    return "tint_decay" if "tint_decay" in given else ""
+    exclude = {
+        "--exposure=per_image": model.exposure == "per_image" and model.far_field != "field",
+        "--field=tnsr": model.field == "tnsr",
+        "--pixels=background": config.scene.pixels == "background",
+        f"--tints={model.tints}": "tints" in given and model.tints != "none",
+        "--tint_decay": "tint_decay" in given,
+    }
+    return next((option for option, holds in exclude.items() if holds), "")
 
 
-def _field_inside(left: str, ball: choices.BallOption | None) -> str:
-    """Returns why the inside of an object is a field, and where else that is sampled."""
-    at = f", in field_ball={','.join(map(str, ball))} where masks show the object" if ball else ""
-    why = f"{left}, of which a field learns a part{at}"
-    return f"interior=field: {why}. --interior=absorbing is faster and has none"
-
-
-def _ball(
-    config: TrainConfig, made: Path, run: Path, say: config_flags.Say
-) -> choices.BallOption | None:
+def _ball(config: TrainConfig, made: Path, say: config_flags.Say) -> choices.BallOption | None:
     """Returns a ball around all that the training masks show, if the far field may be a backdrop.
 
-    The reconstructed object may lack thin and opaque parts, which a field around it learns. A run
-    that has begun keeps its ball. Without masks, or with masks that are known to be wrong, there is
-    none.
+    The reconstructed object may lack thin and opaque parts, which a field around it learns. Without
+    masks, or with masks that are known to be wrong, there is none.
     """
     from experiments.r3f import geometry_stage, records
     from refref_jax.data import SceneError
     from refref_jax.reconstruct import ReconstructionError
-    from refref_jax.training import run_folder
 
     if config.model.far_field == "field":
         return None
-    if (run / _CONFIG).is_file():
-        return run_folder.read_config(run).model.field_ball
     inside = "warning: the field is sampled inside the object only"
     if records.read(made).config.outliers:
         say(f"{inside}, as --outliers says that masks may be wrong")

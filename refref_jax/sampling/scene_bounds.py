@@ -222,10 +222,13 @@ class DistanceWarp(NamedTuple):
 def background_distance(domain: Domain, line: Polyline) -> Float[Array, ""]:
     """Returns the distance of the scene bounds from the start of a path's last segment.
 
-    It is `inf` where there are none, and has no gradient, see `exit_distance`.
+    It is `inf` where there are none ahead, 0 where the path has bent beyond them, and has no
+    gradient, see `exit_distance`.
     """
     last = _last_segment(line)
     leave = exit_distance(domain, line.points[last], line.directions[last])
+    if domain.space != "unbounded":
+        leave = jnp.where((last > 0) & jnp.isinf(leave), 0.0, leave)
     return jax.lax.stop_gradient(leave)
 
 
@@ -245,7 +248,9 @@ def warp_along(domain: Domain, line: Polyline, *, near: float, far: float) -> Di
       near: distance of the first sample, world units.
       far: distance of the last sample from the last bend, where the path misses the bounds.
     """
-    last, leave = _last_segment(line), background_distance(domain, line)
+    last = _last_segment(line)
+    leave = exit_distance(domain, line.points[last], line.directions[last])
+    leave = jax.lax.stop_gradient(leave)
     end = line.knots[last] + jnp.where(jnp.isfinite(leave), leave, far)
     if line.stop is not None:
         end = jnp.where(jnp.isfinite(line.stop), line.stop, end)
@@ -282,15 +287,16 @@ def _ladder(
 
 
 def check_size(domain: Domain, ball: BallOption) -> None:
-    """Checks that a ball in which a field is sampled is no larger than the background.
+    """Checks that a ball in which a field is sampled is no larger than one around the background.
 
     Raises:
       ValueError: if it is: the cells of its grid would be too large for an object.
     """
-    if domain.space != "unbounded" and ball[3] > domain.radius:
+    most = math.sqrt(3.0) * domain.radius
+    if domain.space != "unbounded" and ball[3] > most:
         raise ValueError(
-            f"field_ball={','.join(map(str, ball))} is larger than the background, whose radius is "
-            f"{domain.radius:g}. Give a ball around the object."
+            f"field_ball={','.join(map(str, ball))} is larger than a ball of radius {most:g} "
+            "around the background. Give a ball around the object."
         )
 
 
@@ -318,7 +324,7 @@ def is_occupied(grid: OccupancyGrid, points: Float[Array, "points 3"]) -> Bool[A
 def meets_occupied(grid: OccupancyGrid, ray: Rays) -> Bool[Array, ""]:
     """Returns whether a straight ray meets an occupied cell within the ball.
 
-    It is looked for at steps of a quarter of a cell.
+    The ray is sampled at steps of a quarter of a cell.
     """
     ball = jnp.asarray(grid.ball, ray.origins.dtype)
     middle, half = chord(ball[3], ray.origins - ball[:3], ray.directions)

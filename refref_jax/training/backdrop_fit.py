@@ -365,8 +365,8 @@ def read_front(config: ModelConfig, scene: Scene, folder: Path) -> Front:
 def _hull(frames: Frames, ball: BallOption, *, cells: int) -> OccupancyGrid:
     """Returns an occupancy grid of the masks' hull.
 
-    A cell is occupied if at least one camera sees it, and all masks of those that do show the
-    object no farther from it than its footprint and a pixel. The hull may be too large, unlike the
+    A cell is occupied if at least one camera sees it, and every camera that does has the object in
+    its mask, within the cell's footprint plus a pixel. The hull may be too large, unlike the
     surface of `reconstruct.masks`, which loses what is thinner than its cells.
 
     Source: Laurentini, The Visual Hull Concept for Silhouette-Based Image Understanding (1994).

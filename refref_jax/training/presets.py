@@ -147,8 +147,8 @@ def _backdrop(model: ModelConfig, asked: FieldConfig, in_front: InFront) -> Back
     """
     if asked.exposure == "per_image" and in_front == "field":
         raise ValueError(
-            "exposure=per_image is learned with a backdrop, but not if a field is in front of it. "
-            "Use exposure=fixed, or far_field=field without field_ball."
+            "exposure=per_image cannot be learned with a field in front of a backdrop. Use "
+            "exposure=fixed, or far_field=field."
         )
     if asked.field_ball and (in_front, model.interior) != ("field", "field"):
         raise ValueError("field_ball needs interior=field. Add it, or leave field_ball out.")

@@ -333,7 +333,7 @@ def _resolve_far_field(
     """Decides whether the world behind the objects is a surface, and how to solve for it.
 
     Raises:
-      ValueError: if far_field=backdrop where a field is needed.
+      ValueError: if far_field=backdrop where a field is needed, or an option needs the other.
     """
     needs, model = _needs_of_a_field(config, facts), config.model
     if model.far_field == "backdrop" and needs:
@@ -344,6 +344,8 @@ def _resolve_far_field(
         choice, why = _choose_far_field(config, facts, needs)
         config = _decide(config, reasons, why, far_field=choice)
     if config.model.far_field == "backdrop":
+        if config.scene.pixels == "background" and _in_front(config, facts):
+            raise ValueError("pixels=background has none of a field in front. Use pixels=all.")
         return _decide(
             config,
             reasons,
@@ -358,8 +360,7 @@ def _resolve_far_field(
         config = config.decided(field_ball=None)
     for name in BACKDROP_ONLY:
         if (value := config.get(name)) is not None:
-            instead = "Leave it out, or use far_field=backdrop."
-            raise ValueError(f"{name}={value} has no effect with far_field=field. {instead}")
+            raise ValueError(f"{name}={value} needs far_field=backdrop. Add it, or leave this out.")
     return config
 
 
@@ -371,8 +372,6 @@ def _needs_of_a_field(config: TrainConfig, facts: SceneFacts) -> list[str]:
         "straight rays (paths=straight)": facts.analysis.parts > 0 and not config.paths.max_bends,
         "contraction=always": config.model.contraction == "always",
         f"a surface or deformation (field={config.model.field})": config.model.field in others,
-        "a field whose pixels are left out (pixels=background)": config.scene.pixels == "background"
-        and bool(_in_front(config, facts)),
     }
     return [name for name, holds in needs.items() if holds]
 

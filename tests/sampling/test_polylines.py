@@ -115,6 +115,22 @@ def test_a_path_in_a_ball_ends_on_the_background(away, length):
     np.testing.assert_allclose(line.stop, length, atol=1e-5)
 
 
+@pytest.mark.parametrize("below", [-0.1, 0.0, 1e-6, 0.01])
+@pytest.mark.parametrize("space", ["bounded", "spherical"])
+def test_a_path_through_glass_that_reaches_below_the_floor_ends_there(space, below):
+    down = [0, 0, -1]
+    path = made_paths.path([1.0, 2.0 + below], [down, down, down], [0, 1, 0], origin=(0, 0, 1))
+    path = jax.tree.map(jnp.asarray, path)
+    room = scene_bounds.Domain(2.0, space)
+    end = scene_bounds.background_distance(room, polylines.whole_path(path))
+    line = polylines.path_in_ball(path, (0.0, 0.0, -1.5, 1.0), end=end)
+    np.testing.assert_allclose(line.stop, 2.0 + max(below, 0.0), atol=1e-5)
+    open_air = scene_bounds.background_distance(
+        scene_bounds.Domain(2.0, "unbounded"), polylines.whole_path(path)
+    )
+    assert np.isinf(open_air)
+
+
 def test_a_path_in_a_ball_ends_on_an_opaque_surface():
     path = _elbow()._replace(stop=light_paths.Stop(jnp.float32(5.5), None))
     line = _in_ball(path, _BALL)

@@ -538,6 +538,8 @@ def test_an_object_that_no_model_explains_is_told(after, doubted):
         (0.07, {"tints": "none"}, "field"),
         (0.07, {"tint_decay": 0.01}, None),
         (0.07, {"exposure": "fixed"}, "field"),
+        (0.07, {"pixels": "background"}, None),
+        (0.07, {"field": "tnsr"}, None),
         (0.07, {"exposure": "per_image"}, None),
         (0.07, {"exposure": "per_image", "far_field": "field"}, "field"),
         (0.07, {"far_field": "field"}, "field"),
@@ -586,6 +588,11 @@ def test_wrong_masks_and_earlier_runs_have_no_field_around_the_object(
     (tmp_path / "begun").mkdir()
     config_files.write(tmp_path / "begun" / "config.json", asked.decided(interior="field"))
     assert ball("begun") is None
+    (tmp_path / "absorbing").mkdir()
+    begun = asked.decided(interior="absorbing")
+    config_files.write(tmp_path / "absorbing" / "config.json", begun)
+    kept = training_body.with_parts(asked, parts, made, run=tmp_path / "absorbing", **options)
+    assert kept.model.interior is None and not said
 
     found = records.read(made)
     doubtful = dataclasses.replace(found, config=dataclasses.replace(found.config, outliers=1))
