@@ -113,7 +113,7 @@ _SHAPES = {"origins": (3,), "directions": (3,), "radii": ()}
 def _deviations_seen(
     trial: Trial, deviations: Float[np.ndarray, " normals"]
 ) -> Callable[[Rays], Float[np.ndarray, "h w"]]:
-    """Returns a function of rays: the deviation of the normal that each sees, NaN beside it."""
+    """Returns a function of rays: the deviation of the normal that each sees, NaN if none."""
     part = trial.candidate.parts[0]
     surfaces, nearest = pack_meshes([trial.mesh]), KDTree(part.vertices)
     of_vertices = np.zeros(len(part.vertices))

@@ -33,8 +33,8 @@ FLAGS = (METHOD, *_RECONSTRUCTED)
 
 Options = Mapping[str, flags.FlagHolder]
 
-# File of a run that has begun, and where a field in front of a backdrop is sampled.
-_CONFIG, _AROUND = "config.json", "In front of a backdrop, it is sampled in field_ball="
+# File of a run that has begun.
+_CONFIG = "config.json"
 
 FOLDER = "r3f"
 """Folder of the reconstruction, relative to the run's folder."""
@@ -263,11 +263,13 @@ def _with_field(
         return config
     else:
         ball = config.model.field_ball or _ball(config, made, say)
-        where = f"{_AROUND}{','.join(map(str, ball))}, where masks show it. " if ball else ""
         say(
-            f"interior=field: {left}; a field learns part of it. {where}Use --interior=absorbing "
-            "to train faster, without it."
+            f"interior=field: {left}; a field learns part of it. Use --interior=absorbing to train "
+            "faster, without it."
         )
+        if ball:
+            around = f"field_ball={','.join(map(str, ball))}"
+            say(f"{around}: in front of a backdrop, the field is sampled there, within the masks.")
     config = config.decided(interior="field")
     return config if "field_ball" in config.overrides() else config.decided(field_ball=ball)
 

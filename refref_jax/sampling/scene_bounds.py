@@ -225,15 +225,17 @@ def background_distance(domain: Domain, line: Polyline) -> Float[Array, ""]:
     It is `inf` where there are none ahead, 0 where the path has bent beyond them, and has no
     gradient, see `exit_distance`.
     """
-    last = _last_segment(line)
+    last, leave = _last_exit(domain, line)
+    if domain.space == "unbounded":
+        return leave
+    return jnp.where((last > 0) & jnp.isinf(leave), 0.0, leave)
+
+
+def _last_exit(domain: Domain, line: Polyline) -> tuple[Int[Array, ""], Float[Array, ""]]:
+    """Returns the index of a path's last segment, and the exit distance from its start."""
+    last = jnp.sum(jnp.isfinite(line.knots)) - 1
     leave = exit_distance(domain, line.points[last], line.directions[last])
-    if domain.space != "unbounded":
-        leave = jnp.where((last > 0) & jnp.isinf(leave), 0.0, leave)
-    return jax.lax.stop_gradient(leave)
-
-
-def _last_segment(line: Polyline) -> Int[Array, ""]:
-    return jnp.sum(jnp.isfinite(line.knots)) - 1
+    return last, jax.lax.stop_gradient(leave)
 
 
 def warp_along(domain: Domain, line: Polyline, *, near: float, far: float) -> DistanceWarp:
@@ -248,9 +250,7 @@ def warp_along(domain: Domain, line: Polyline, *, near: float, far: float) -> Di
       near: distance of the first sample, world units.
       far: distance of the last sample from the last bend, where the path misses the bounds.
     """
-    last = _last_segment(line)
-    leave = exit_distance(domain, line.points[last], line.directions[last])
-    leave = jax.lax.stop_gradient(leave)
+    last, leave = _last_exit(domain, line)
     end = line.knots[last] + jnp.where(jnp.isfinite(leave), leave, far)
     if line.stop is not None:
         end = jnp.where(jnp.isfinite(line.stop), line.stop, end)
@@ -286,7 +286,7 @@ def _ladder(
     return (1.0 + t / _scale(warp)) ** _LAMBDA
 
 
-def check_size(domain: Domain, ball: BallOption) -> None:
+def check_ball_size(domain: Domain, ball: BallOption) -> None:
     """Checks that a ball in which a field is sampled is no larger than one around the background.
 
     Raises:

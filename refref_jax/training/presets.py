@@ -46,7 +46,7 @@ from refref_jax.fields import hash_grid, msnerf, registry
 from refref_jax.fields.base import RadianceConfig
 from refref_jax.fields.hash_grid import HashGridConfig
 from refref_jax.render.model import BackdropConfig, ModelConfig, ProposalConfig, SplatsConfig
-from refref_jax.sampling.scene_bounds import Bounds, check_size
+from refref_jax.sampling.scene_bounds import Bounds, check_ball_size
 from refref_jax.training import learned_surface
 from refref_jax.training.config import (
     BACKDROP_ONLY,
@@ -153,7 +153,7 @@ def _backdrop(model: ModelConfig, asked: FieldConfig, in_front: InFront) -> Back
     if asked.field_ball and (in_front, model.interior) != ("field", "field"):
         raise ValueError("field_ball needs interior=field. Add it, or leave field_ball out.")
     if asked.field_ball:
-        check_size(model.domain, asked.field_ball)
+        check_ball_size(model.domain, asked.field_ball)
     return BackdropConfig(
         asked.backdrop_resolution or BACKDROP_RESOLUTION,
         in_front=in_front,

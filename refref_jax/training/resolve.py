@@ -345,7 +345,7 @@ def _resolve_far_field(
         config = _decide(config, reasons, why, far_field=choice)
     if config.model.far_field == "backdrop":
         if config.scene.pixels == "background" and _in_front(config, facts):
-            raise ValueError("pixels=background has none of a field in front. Use pixels=all.")
+            raise ValueError("pixels=background cannot train the field in front. Use pixels=all.")
         return _decide(
             config,
             reasons,

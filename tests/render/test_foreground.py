@@ -16,7 +16,7 @@ from refref_jax.geometry.cameras import image_rays
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics.light_paths import Stop
 from refref_jax.optics.path_settings import PATH_PRESETS
-from refref_jax.render import Model, backdrop, pixels, render_image, render_rays
+from refref_jax.render import Model, backdrop, pixels, render_image, render_rays, volume_rendering
 from refref_jax.render.model import (
     BackdropConfig,
     Layers,
@@ -50,6 +50,15 @@ def _bent():
 
 def _straight():
     return made_paths.path([], [(0, 0, -1)], [0], origin=(0, 0, 3), segments=3)
+
+
+def test_a_field_in_a_ball_ends_on_the_background():
+    room = MODEL.radius
+    surface = dataclasses.replace(_SURFACE, field_ball=(0.0, 0.0, -room, 2.0))
+    config, path = dataclasses.replace(MODEL, backdrop=surface), _straight()
+    line = volume_rendering.polyline(config, jax.tree.map(jnp.asarray, path))
+    np.testing.assert_allclose(line.points[0], [0.0, 0.0, 2.0 - room], atol=1e-5)
+    np.testing.assert_allclose(line.stop, 2.0, atol=1e-5)  # not 4: the wall is in its middle
 
 
 @functools.partial(jax.jit, static_argnums=0)

@@ -114,6 +114,14 @@ def test_a_path_in_a_ball_ends_on_the_background(away, length):
     line = polylines.path_in_ball(path, (away, 0.0, 0.0, 1.0), end=end)
     np.testing.assert_allclose(line.stop, length, atol=1e-5)
 
+    def stop(points, end):
+        moved = path._replace(points=points)
+        return polylines.path_in_ball(moved, (away, 0.0, 0.0, 1.0), end=end).stop
+
+    slopes = jax.grad(stop, argnums=(0, 1))(path.points, end)
+    assert gradients.all_finite(slopes)
+    np.testing.assert_allclose(slopes[1], float(0.0 < length < 2.0), atol=1e-5)
+
 
 @pytest.mark.parametrize("below", [-0.1, 0.0, 1e-6, 0.01])
 @pytest.mark.parametrize("space", ["bounded", "spherical"])
@@ -307,7 +315,7 @@ def test_point_at_check_grads():
 _CASES = {
     "whole_path": lambda paths, t: polylines.whole_path(paths),
     "outside_path": lambda paths, t: polylines.outside_path(paths),
-    "path_in_ball": lambda paths, t: polylines.path_in_ball(paths, (0.5, 0.0, 0.0, 3.0)),
+    "path_in_ball": lambda paths, t: polylines.path_in_ball(paths, (0.5, 0.0, 0.0, 3.0), end=2.0),
     "point_at": lambda paths, t: polylines.point_at(polylines.outside_path(paths), t),
     "segment_at": lambda paths, t: polylines.segment_at(polylines.whole_path(paths), t),
 }

@@ -453,7 +453,7 @@ def test_rays_meet_the_cells_of_a_numpy_grid_under_transformations():
 
 @pytest.mark.parametrize("space", ["bounded", "spherical"])
 def test_a_ball_is_no_larger_than_the_background(space):
-    scene_bounds.check_size(Domain(2.0, space), (0.0, 0.0, -1.5, 3.4))
-    scene_bounds.check_size(Domain(2.0, "unbounded"), (0.0, 0.0, 0.0, 200.0))
+    scene_bounds.check_ball_size(Domain(2.0, space), (0.0, 0.0, -1.5, 3.4))
+    scene_bounds.check_ball_size(Domain(2.0, "unbounded"), (0.0, 0.0, 0.0, 200.0))
     with pytest.raises(ValueError, match="is larger than a ball of radius"):
-        scene_bounds.check_size(Domain(2.0, space), (0.0, 0.0, 0.0, 3.5))
+        scene_bounds.check_ball_size(Domain(2.0, space), (0.0, 0.0, 0.0, 3.5))

@@ -138,22 +138,14 @@ def test_a_field_in_a_ball_is_in_front_of_a_backdrop():
 @pytest.mark.parametrize(
     ("found", "given", "message"),
     [
-        (
-            "clear",
-            {"far_field": "field", "backdrop_resolution": 64},
-            "=64 needs far_field",
-        ),
+        ("clear", {"far_field": "field", "backdrop_resolution": 64}, "=64 needs far_field"),
         ("clear", {"far_field": "field", "iterations": 8}, "iterations=8 needs far_field"),
         ("clear", {"interior": "field", "iterations": 8}, "iterations=8 needs far_field"),
-        (
-            "clear",
-            {"far_field": "field", "field_ball": (0, 0, 0, 2)},
-            "needs far_field=b",
-        ),
+        ("clear", {"far_field": "field", "field_ball": (0, 0, 0, 2)}, "needs far_field=b"),
         ("clear", {"far_field": "backdrop", "field_ball": (0, 0, 0, 2)}, "needs interior=field"),
         ("clear", {**_AROUND, "field_ball": (0, 0, 0, 0)}, "is not a ball. Give its centre"),
         ("clear", {**_AROUND, "field_ball": (0, 0, 0, 200)}, "larger than a ball"),
-        ("clear", {**_AROUND, "pixels": "background"}, "none of a field in front. Use pixels=all"),
+        ("clear", {**_AROUND, "pixels": "background"}, "cannot train the field in front. Use"),
         ("clear", {"field_ball": (0, 0, 0, math.inf)}, "is not a ball. Give its centre"),
         ("clear", {**_AROUND, "field_ball": (0, 0, math.nan, 1)}, r"field_ball\[2\] is NaN"),
         ("clear", {"far_field": "backdrop", "contraction": "always"}, "contraction=always"),
